@@ -330,6 +330,8 @@ class ReportConfig(Options):
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional]
     """directories of the runs"""
+    pdf: bool = False
+    """write the figures as PDF, too, for a paper"""
     out: str | None = None
     """directory of the report; must not exist (default: a new one under runs/report)"""
 

@@ -6,6 +6,8 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.style
+
 from swiftwrf import InputError
 from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.runtime.checkpoint import refusing
@@ -16,7 +18,8 @@ from tasks.configs import ReportConfig
 from tasks.directory import check_new_file, new_directory
 from tasks.environment import choose_device, environment, stamp
 from tasks.locate import page as locate
-from tasks.page.page import REPORT, rendered, write_page
+from tasks.page.figures import STYLE
+from tasks.page.page import FIGURES, REPORT, Page, rendered, write_page
 from tasks.records import Records
 from tasks.rssi import page as rssi
 from tasks.terminal import Answer, terminal
@@ -29,7 +32,7 @@ ANSWERS = {"aoa": aoa.answer_of, "rssi": rssi.answer, "locate": locate.answer}
 def run(config: ReportConfig) -> None:
     """Write the report and print its place."""
     out = Path(config.out) if config.out else Path("runs") / "report" / stamp()
-    merge([Path(folder) for folder in config.runs], out)
+    merge([Path(folder) for folder in config.runs], out, pdf=config.pdf)
     page = out / REPORT
     terminal.page({"runs": list(config.runs)}, "", page)
 
@@ -55,7 +58,15 @@ def write(result: Recorded, file: Path | None) -> Answer | None:
     return None
 
 
-def merge(folders: list[Path], out: Path) -> None:
+def write_pdf(folder: Path, page: Page) -> None:
+    """Write the panels of each plot into `figures/` as PDF."""
+    with matplotlib.style.context(STYLE):
+        for plot in page.plots:
+            for name, panel in zip(plot.files, plot.panels, strict=True):
+                panel.savefig(folder / FIGURES / f"{name}.pdf", metadata={"CreationDate": None})
+
+
+def merge(folders: list[Path], out: Path, *, pdf: bool = False) -> None:
     """Write one report over several finished runs of one task.
 
     Raises:
@@ -70,7 +81,9 @@ def merge(folders: list[Path], out: Path) -> None:
         )
     names = ", ".join(os.fspath(run.folder) for run in runs)
     with new_directory(out, "a report") as unfinished, refusing(f"{names} does not hold what a report shows"):
-        write_page(unfinished, PAGES[tasks[0]](runs))
+        page = write_page(unfinished, PAGES[tasks[0]](runs))
+        if pdf:
+            write_pdf(unfinished, page)
 
 
 if __name__ == "__main__":

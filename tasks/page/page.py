@@ -23,7 +23,7 @@ from tasks.terminal import Answer, NextStep, terminal
 
 HALF = 92  # letters of a table that fit into half of the page
 WIDE = 7.5  # [inches] figures that are wider take the whole width of the page, others half
-REPORT = "report.html"  # its file
+REPORT, FIGURES = "report.html", "figures"  # its file, and the folder of its figures
 MAX_SECTIONS = 5  # of a page, whose navigation has the details, too
 
 
@@ -175,7 +175,7 @@ def rendered(page: Page) -> tuple[str, dict[str, str]]:
 
 def write_page(folder: Path, page: Page) -> Page:
     """Write the panels of each plot and its numbers into `figures/`, and `report.html` with the same panels inlined."""
-    figures, (html, svg) = folder / "figures", rendered(page)
+    figures, (html, svg) = folder / FIGURES, rendered(page)
     figures.mkdir(parents=True, exist_ok=True)
     for file, text in svg.items():
         write_text(figures / f"{file}.svg", text)

@@ -361,3 +361,12 @@ def test_floors_have_maps_of_one_size_the_strongest_receivers_first(tmp_path):
     assert marks == [["1"], [], ["1"]]
     classes = np.array(["not covered", "uncertain", "covered"])[np.digitize(run.maps["above"], [0.1, 0.9])]
     assert coverage.data["coverage"].tolist() == classes.ravel().tolist()
+
+
+def test_a_report_has_its_figures_as_pdf(rssi_run, tmp_path):
+    merge([rssi_run], tmp_path / "report", pdf=True)
+    figures = tmp_path / "report" / "figures"
+    drawn = {file.stem for file in figures.glob("*.svg")}
+    assert drawn
+    assert {file.stem for file in figures.glob("*.pdf")} == drawn
+    assert all(file.read_bytes().startswith(b"%PDF") for file in figures.glob("*.pdf"))
