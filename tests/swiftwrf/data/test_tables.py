@@ -306,7 +306,7 @@ def test_zones_of_unknown_hemisphere_are_refused(table):
 
 @pytest.mark.parametrize("long", [False, True])
 def test_relayed_packets_are_no_rssi_of_this_place(table, long):
-    """A relay sends from another place, so its packets are left out, and what is left is the table without them."""
+    """A relay sends from another place, so its packets are left out, and the rest is the table without them."""
     mesh = table[["x", "y", "a"]].rename(columns={"a": "rx_rssi"}).assign(rx_snr=4.5)
     mesh = mesh.assign(gateway_id="!7c5a01f2") if long else mesh
     relayed = np.arange(N) % 3 == 1
