@@ -21,6 +21,26 @@ def gpu_seconds() -> str:
     return markdown(["fit", "seconds"], [[name, f"{s:.1f}"] for name, s in load("gpu_training")["seconds"].items()])
 
 
+def profiles(min_share: float = 0.1) -> str:
+    """Return the steps, models and locators that take a tenth of the time of a command or more."""
+    kinds = (
+        "augment.turbo.stages",
+        "augment.choose",
+        "augment.cross",
+        "swiftwrf.models.geometry",
+        "swiftwrf.locate",
+        "tasks.page",
+    )
+    rows = [
+        [f"{name}, {found['seconds']:.0f} s", f"`{row['function']}`", f"{row['below']:.0%}"]
+        for name, found in load("profiles").items()
+        if isinstance(found, dict) and "functions" in found
+        for row in found["functions"]
+        if row["function"].startswith(kinds) and row["below"] >= min_share and "<" not in row["function"]
+    ]
+    return markdown(["command", "function", "share, with all below"], rows)
+
+
 def scaling() -> str:
     """Return processor seconds and peak memory of each stage at each size, and the growth to the largest size."""
     content = load("scaling")
