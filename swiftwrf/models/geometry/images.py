@@ -217,7 +217,7 @@ class LinkAt:
         # positions first in memory: products at each position follow
         phase = phase.permute(2, 1, 0).contiguous()[:, :, None] * frequency.float()[:, None]
         amplitude = length.reciprocal().T[:, :, None, None]
-        wave = torch.complex(phase.cos().mul_(amplitude), phase.sin_().mul_(amplitude))
+        wave = torch.complex(phase.cos() * amplitude, phase.sin() * amplitude)
         return wave.expand(len(self), -1, -1, -1).transpose(0, 1)
 
     def wave(self, source: Tensor) -> Tensor:

@@ -323,7 +323,8 @@ def test_spectra_at_one_position_are_held_out_together():
 def test_a_locator_whose_numbers_overflow_is_refused(closed_form, name, value, says):
     _, test, locator = closed_form
     tensors, header = locator.state()
-    damaged = tensors | {name: torch.full_like(tensors[name], value)}
+    every = tensors | {"weight": torch.ones_like(tensors["weight"])}  # one of weight 0 is not evaluated
+    damaged = every | {name: torch.full_like(tensors[name], value)}
     with pytest.raises(InputError, match=says):
         MatchedField.from_state(damaged, header).locate(test.spectrum[:2])
 
