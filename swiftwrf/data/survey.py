@@ -346,7 +346,8 @@ class _Survey:
         if not self.names:
             raise InputError(
                 f"{self.source} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
-                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*'"
+                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', or map "
+                "another quantity: quantity and unit"
             )
         if len(self.names) == 1 and "rssi" not in asked and not self.end:
             where = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]
