@@ -25,7 +25,7 @@ from tasks.directory import new_directory
 from tasks.environment import command, stamp
 from tasks.page import figures
 from tasks.page.page import REPORT, Number, Page, Plot, Section, Summary, Table, write_page
-from tasks.page.shared import MEASURED, SUGGESTED
+from tasks.page.shared import MEASURED, NEXT
 from tasks.records import RECEIVERS, Records, Row, rounded, write_table
 from tasks.terminal import NextStep, terminal
 
@@ -240,7 +240,7 @@ def _panel(
     drawn = plan.scatter(x, y, c=probability, s=9, marker="s", cmap="viridis", vmin=0, vmax=1, rasterized=True)
     plan.plot(*survey.receiver_position[survey.receiver_located][:, :2].numpy().T, "^", color=MEASURED, markersize=6)
     for rank, place in enumerate(chosen[:, :2].tolist(), start=1):
-        plan.plot(*place, "X", color=SUGGESTED, markersize=9)
+        plan.plot(*place, "X", color=NEXT, markersize=9)
         plan.annotate(str(rank), place, xytext=(5, 5), textcoords="offset points", fontsize=8)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plan.set_title(title, fontsize=9)

@@ -30,9 +30,9 @@ from tasks.page.shared import (
     difference,
     errors_section,
     limits,
+    maps_suggestion,
     next_steps,
     recommendation,
-    suggestion_section,
 )
 from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.terminal import Answer, Method, NextStep
@@ -159,16 +159,10 @@ def _rooms_sentence(run: Records) -> str:
 
 
 def _suggestion(run: Records) -> Section | None:
-    return suggestion_section(
-        "",
-        run.arrays(SUGGESTED),
-        SUGGESTED,
-        run.file_name,
-        what="the variance of the radio maps",
-        whole="the field's variance",
-        how="The mean over the region is weighted by the expected squared position error. Errors are those of simulated "
+    return maps_suggestion(
+        run,
+        "The mean over the region is weighted by the expected squared position error. Errors are those of simulated "
         "rows under the fitted maps.",
-        label="weighted variance left [%]",
     )
 
 

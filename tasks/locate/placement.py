@@ -16,7 +16,7 @@ from swiftwrf.runtime.durable import write_npz
 from tasks import labels
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
-from tasks.page.shared import MAX_NUMBERED, MEASURED, SUGGESTED
+from tasks.page.shared import MAX_NUMBERED, MEASURED, NEXT
 from tasks.records import write_table
 
 ARROW_M = 0.4  # length of the arrow along which an array faces, in plan
@@ -53,11 +53,11 @@ def poses_section(arrays: Mapping[str, NDArray[Any]], table: str, name: str) -> 
     figure, plan = figures.panel(5, 4.2)
     plan.plot(*arrays["measured"][:, :2].T, ".", color=MEASURED, markersize=3, label="measured")
     plan.plot(*arrays["stations"][:, :2].T, "^", color=labels.colour(labels.LOCALIZERS, "posterior"), label="arrays")
-    plan.plot(*position[:, :2].T, "D", color=SUGGESTED, markersize=5, label="suggested")
+    plan.plot(*position[:, :2].T, "D", color=NEXT, markersize=5, label="suggested")
     plan.quiver(
         *position[:, :2].T,
         *ARROW_M * normal[:, :2].T,
-        color=SUGGESTED,
+        color=NEXT,
         angles="xy",
         scale_units="xy",
         scale=1,

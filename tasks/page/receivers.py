@@ -13,7 +13,7 @@ from swiftwrf.contrib.comparison.base import Recorded
 from swiftwrf.contrib.survey.receivers import locate_receivers
 from tasks.page import figures
 from tasks.page.page import Plot, Section, Table
-from tasks.page.shared import MEASURED, SUGGESTED
+from tasks.page.shared import MEASURED, NEXT
 from tasks.records import RECEIVERS, Records
 
 MAX_ESTIMATED = 60  # most often detected receivers whose positions a run estimates, which takes half a second each
@@ -76,8 +76,8 @@ def receivers_section(run: Records) -> Section | None:
     plan.plot(*measured.T, ".", color=MEASURED, markersize=2, label="measured", rasterized=many)
     for at, each, out in zip(position, radius, outside, strict=True):
         style = "--" if out > 0.5 else "-"
-        plan.add_patch(Circle(at[:2], each, fill=False, color=SUGGESTED, linewidth=0.8, linestyle=style))
-    plan.plot(*position[:, :2].T, "x", color=SUGGESTED, markersize=7, markeredgewidth=2, label="estimated receiver")
+        plan.add_patch(Circle(at[:2], each, fill=False, color=NEXT, linewidth=0.8, linestyle=style))
+    plan.plot(*position[:, :2].T, "x", color=NEXT, markersize=7, markeredgewidth=2, label="estimated receiver")
     for name, at in list(zip(names, position, strict=True))[: MAX_NAMED if len(names) <= MAX_NAMED else 0]:
         plan.annotate(figures.short(name), at[:2], xytext=(4, 4), textcoords="offset points", fontsize=figures.LABEL)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -20,10 +20,10 @@ from tasks.environment import command
 from tasks.page import figures
 from tasks.page.figures import MAX_CURVES, Colours
 from tasks.page.page import Plot, Section, Summary, Table, number
-from tasks.records import Records, write_table
+from tasks.records import SUGGESTED, Records, write_table
 from tasks.terminal import Answer, NextStep
 
-MEASURED, SUGGESTED = "#3a7fd5", "#cf4a4a"
+MEASURED, NEXT = "#3a7fd5", "#cf4a4a"
 MIN_REDUCTION = 0.1  # of the variance, below which more positions are not worth it
 NOT_WORTH = "no further position is worth measuring for the coverage: its uncertainty would hardly fall"
 MAX_NUMBERED = 30  # suggestions with their rank beside them; more would hide each other
@@ -195,6 +195,20 @@ def write_suggestion(
     write_npz(file.with_name(f"{file.name}.npz"), {name: values.numpy() for name, values in arrays.items()})
 
 
+def maps_suggestion(run: Records, how: str) -> Section | None:
+    """Return the plan of positions that lower the variance of the radio maps of a run, see `suggestion_section`."""
+    return suggestion_section(
+        "",
+        run.arrays(SUGGESTED),
+        SUGGESTED,
+        run.file_name,
+        what="the variance of the radio maps",
+        whole="the field's variance",
+        how=how,
+        label="weighted variance left [%]",
+    )
+
+
 def suggestion_section(
     title: str,
     arrays: Mapping[str, NDArray[Any]],
@@ -216,13 +230,13 @@ def suggestion_section(
     measured, suggested, left = (arrays[key] for key in ("measured", "suggested", "left"))
     first, plan = figures.panel(5, 4.2)
     plan.plot(*measured[:, :2].T, ".", color=MEASURED, markersize=3, label="measured")
-    plan.plot(*suggested[:, :2].T, "D", color=SUGGESTED, markersize=4, label="to measure next")
+    plan.plot(*suggested[:, :2].T, "D", color=NEXT, markersize=4, label="to measure next")
     for rank, (x, y) in enumerate(suggested[:MAX_NUMBERED, :2], start=1):
         plan.annotate(str(rank), (x, y), xytext=(3, 3), textcoords="offset points", fontsize=7)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     figures.legend_below(plan)
     second, gain = figures.panel(4.6, 3.4)
-    gain.plot(range(len(left)), 100 * left, color=SUGGESTED)
+    gain.plot(range(len(left)), 100 * left, color=NEXT)
     gain.set(xlabel="suggested positions measured", ylabel=label, ylim=(0, None))
     text = (
         f"Measuring at {len(suggested)} more positions ({table}.csv, the most useful first) would reduce {what} from "

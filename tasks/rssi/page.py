@@ -27,9 +27,9 @@ from tasks.page.shared import (
     difference,
     errors_section,
     limits,
+    maps_suggestion,
     next_steps,
     recommendation,
-    suggestion_section,
 )
 from tasks.records import RECEIVERS, SUGGESTED, Records, notes
 from tasks.rssi import coverage
@@ -98,16 +98,10 @@ def _summary(run: Records, found: Answer) -> Summary:
 
 
 def _suggestion(run: Records) -> Section | None:
-    return suggestion_section(
-        "",
-        run.arrays(SUGGESTED),
-        SUGGESTED,
-        run.file_name,
-        what="the variance of the radio maps",
-        whole="the field's variance",
-        how="The mean over the walked area is weighted by p (1 - p), where p is the probability that a scan has a receiver "
+    return maps_suggestion(
+        run,
+        "The mean over the walked area is weighted by p (1 - p), where p is the probability that a scan has a receiver "
         "above the threshold of the coverage.",
-        label="weighted variance left [%]",
     )
 
 

@@ -90,7 +90,7 @@ def test_probabilities_are_sums_of_masses():
     np.testing.assert_allclose(columns["room_probability"], np.max(expected, axis=1))
 
 
-def test_the_probable_room_is_the_true_one_as_often_as_it_says():
+def test_probabilities_of_rooms_are_calibrated():
     """Four rooms of 10 x 8 m: the share of rows whose most probable room is right against the mean probability of it."""
     train, test = rssi_room(n=400, seed=5).split()
     xs, ys = (0.0, 10.0, 20.0), (0.0, 8.0, 16.0)
