@@ -120,12 +120,13 @@ def _step(name: str, samples: Tensor, before: Tensor | None = None) -> Row:
 
 def _line(step: Row) -> str:
     """Return a step in words."""
-    text = (
-        f"{step['step']}: coverage {step['coverage']:.0%} ({step['coverage_low']:.0%} to {step['coverage_high']:.0%})"
-    )
-    if "gain" not in step:
-        return text
-    return f"{text}, {_gain(step)} points"
+    text, gain = f"{step['step']}: coverage {_coverage(step)}", _gain(step)
+    return f"{text}, {gain} points" if gain else text
+
+
+def _coverage(step: Row) -> str:
+    """Return the coverage of a step with its interval."""
+    return f"{step['coverage']:.0%} ({step['coverage_low']:.0%} to {step['coverage_high']:.0%})"
 
 
 def _gain(step: Row) -> str:
@@ -160,16 +161,7 @@ def page(found: CoveragePlan, config: PlanConfig, records: Records) -> Page:
     """Return the report: coverage before and after in plan, and tables of the steps and of the best candidates."""
     content = values(found, config)
     first, last = content["steps"][0], content["steps"][-1]
-    rows = [
-        [
-            step["step"],
-            f"{step['coverage']:.0%} ({step['coverage_low']:.0%} to {step['coverage_high']:.0%})",
-            f"{_points(step['gain'])} ({_points(step['gain_low'])} to {_points(step['gain_high'])})"
-            if "gain" in step
-            else "",
-        ]
-        for step in content["steps"]
-    ]
+    rows = [[step["step"], _coverage(step), _gain(step)] for step in content["steps"]]
     caption = (
         f"Expected share of scans above {found.threshold_dbm:g} dBm in the measured area, with {LEVEL:.0%} intervals."
     )

@@ -333,7 +333,7 @@ def floors_of_a_building(tmp_path, n_receivers=20):
     run = made_run(
         tmp_path, **fields, receiver=np.full((n_receivers, 3), np.nan), floor_names=np.array(["0", "1", "2"])
     )
-    shares = {"threshold_dbm": -75.0, "certainty": 0.9, "covered": 0.25, "not_covered": 0.25, "uncertain": 0.5}
+    shares = {"threshold_dbm": -75.0, "certainty": 0.9, "covered": 0.25, "not_covered": 0.15, "uncertain": 0.6}
     for each in run.metrics["coverage"]:
         each |= shares | {"not_measured": 0.0}
     spots = [{"floor": str(n), "x_m": 1.0 + n, "y_m": 1.0, "threshold_dbm": -75.0} for n in (2, 0)]
@@ -361,6 +361,11 @@ def test_floors_have_maps_of_one_size_the_strongest_receivers_first(tmp_path):
     assert marks == [["1"], [], ["1"]]
     classes = np.array(["not covered", "uncertain", "covered"])[np.digitize(run.maps["above"], [0.1, 0.9])]
     assert coverage.data["coverage"].tolist() == classes.ravel().tolist()
+    for floor, panel in enumerate(coverage.panels):
+        said = [text.get_text() for text in panel.legends[0].get_texts()]
+        shares = run.metrics["coverage"][floor]
+        named = {"covered": "covered", "uncertain": "uncertain", "not covered": "not_covered"}
+        assert said == [*(f"{name} {shares[key]:.0%}" for name, key in named.items()), "not measured"]
 
 
 def test_a_report_has_its_figures_as_pdf(rssi_run, tmp_path):
