@@ -170,9 +170,9 @@ def pooled(rssi: Floats, pool: list[str], by: str, min_spread_db: float = 9.0) -
             fading causes. Not studied.
 
     Example:
-        >>> pooled(np.array([[-50.0, -50.0], [-60.0, np.nan]]), ["hall", "hall"], "mac")[:2]
-        (['hall'], array([[-50.],
-               [-60.]]))
+        >>> pooled(np.array([[-50.0, -53.0], [-60.0, np.nan]]), ["hall", "hall"], "mac")[1].round(1)
+        array([[-51.2],
+               [-60. ]])
     """
     names, columns, apart = list(dict.fromkeys(pool)), [], []
     for name in names:

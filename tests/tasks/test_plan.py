@@ -15,7 +15,7 @@ from test_receivers_run import RECEIVERS, write_hall
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plan")
     table, _ = write_hall(folder / "walk", known=True)
-    assert quick.run("rssi", "--rx", "all", "--data", table, "--out", folder / "run") == 0
+    assert quick.run("rssi", "--rx", "all", "--data", table, "--above", -72, "--out", folder / "run") == 0
     return folder / "run"
 
 
@@ -39,6 +39,30 @@ def test_a_plan_has_a_table_a_report_and_an_answer(run, tmp_path, capsys):
     cell = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.2)])
     mean = -40 - 30 * np.log10(np.linalg.norm(cell[:, None] - RECEIVERS, axis=2))
     assert steps[0]["coverage"] == pytest.approx(1 - norm.cdf((-62 - mean) / 3).prod(axis=1).mean(), abs=0.04)
+
+
+def test_gains_are_said_in_points_of_coverage_at_the_threshold_of_the_run(run, tmp_path, capsys):
+    assert quick.run("plan", run, "--off", "ap2", "--out", tmp_path / "plan") == 0
+    said, report = capsys.readouterr().out, (tmp_path / "plan" / "report.html").read_text()
+    answer = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert answer["threshold_dbm"] == -72
+    off, added = answer["steps"][1:]
+    assert off["gain"] < -0.02
+    assert added["gain"] > 0.02
+    for step in (off, added):
+        gain = "{:+.1f} ({:+.1f} to {:+.1f})".format(*(100 * step[f"gain{end}"] for end in ("", "_low", "_high")))
+        share = "{:.0%} ({:.0%} to {:.0%})".format(*(step[f"coverage{end}"] for end in ("", "_low", "_high")))
+        assert f"{step['step']}: coverage {share}, {gain} points" in said
+        assert gain in report
+        assert share in report
+    assert "not worth it" not in said
+
+
+def test_access_points_that_add_little_are_said_not_to_be_worth_it(run, tmp_path, capsys):
+    assert quick.run("plan", run, "--aps", 2, "--above", -95, "--out", tmp_path / "plan") == 0
+    steps = json.loads((tmp_path / "plan" / "plan.json").read_text())["steps"]
+    assert all(step["gain"] < 0.02 for step in steps[1:])
+    assert "adds less than 2 points is not worth it: 2 of them" in capsys.readouterr().out
 
 
 def test_own_places_are_compared(run, tmp_path, capsys):

@@ -142,8 +142,8 @@ def plan_coverage(
         seed: Seed of the samples.
 
     Raises:
-        InputError: Receivers that move, an unknown receiver, all receivers off, no position of any receiver, or fewer
-            candidates than access points.
+        InputError: Receivers that move, an unknown receiver, no position of any receiver, or fewer candidates than access
+            points.
 
     Example:
         >>> import swiftwrf

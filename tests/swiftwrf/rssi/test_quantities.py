@@ -8,6 +8,7 @@ import torch
 import swiftwrf
 from swiftwrf import InputError, Rssi, RssiModel
 from swiftwrf.data.writing import write_rssi
+from swiftwrf.rssi.coverage import default_threshold
 from swiftwrf.rssi.maps import RssiMap
 
 N = 120
@@ -47,6 +48,20 @@ def test_a_prediction_does_not_depend_on_the_unit():
     assert in_mbps.std is not None
     assert in_bps.std is not None
     torch.testing.assert_close(1e6 * in_mbps.std, in_bps.std, rtol=1e-3, atol=1.0)
+
+
+def test_held_out_errors_are_in_the_unit():
+    small, large = (RssiModel().fit(read(scale)).held_out_db for scale in (1.0, 1e3))
+    assert small.keys() == large.keys() == {"swiftwrf", "mean"}
+    assert {name: 1e3 * error for name, error in small.items()} == pytest.approx(large, rel=1e-3)
+    detrended = TABLE.tcp_download - TABLE.tcp_download.mean()
+    assert small["mean"] == pytest.approx(detrended.abs().mean(), rel=0.05)
+
+
+def test_the_default_threshold_is_the_median():
+    data = Rssi.from_frame(TABLE.assign(tcp_download=TABLE.tcp_download.clip(lower=150)), **OPTIONS)
+    rounded = float(f"{TABLE.tcp_download.clip(lower=150).median():.3g}")
+    assert default_threshold(data) == (rounded, "the median of the measured values")
 
 
 def test_a_model_of_a_quantity_is_updated_and_saved_in_its_unit(tmp_path):

@@ -1,12 +1,21 @@
 """Positions of receivers that a survey does not state."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from swiftwrf import InputError, Rssi, load_rssi, rssi_room
 from swiftwrf.contrib.survey import receivers as module
-from swiftwrf.contrib.survey.receivers import SharedPathLoss, _Evidence, locate_receivers
+from swiftwrf.contrib.survey.receivers import (
+    SharedPathLoss,
+    _Evidence,
+    locate_receivers,
+    strongest_rows,
+    weighted_centroids,
+)
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi.path_loss import PathLoss, harmonics
 
@@ -96,6 +105,45 @@ def test_the_table_is_read_as_positions_of_receivers(tmp_path):
     found.to_frame().to_csv(tmp_path / "receivers.csv", index=False)
     again = load_rssi(tmp_path / "walk.csv", columns={"rssi": "receiver*"})
     np.testing.assert_allclose(again.receiver_position, found.position, atol=0.01)
+
+
+def test_pixels_of_a_floor_plan_are_given_back_as_pixels(tmp_path):
+    """A plan of 20 pixels in a metre, whose y goes down."""
+    data = rssi_room(n=80).columns([0, 1])
+    table = hidden(data).to_frame().rename(columns=lambda name: name.removesuffix("_m"))
+    table.assign(x=20 * table["x"], y=-20 * table["y"]).to_csv(tmp_path / "walk.csv")
+    options = {"columns": {"rssi": "receiver*"}, "scale": 20.0, "y_down": True}
+    found = locate_receivers(load_rssi(tmp_path / "walk.csv", **options))
+    assert float((found.position - data.receiver_position)[:, :2].norm(dim=1).max()) < 4.0
+    found.to_frame().to_csv(tmp_path / "receivers.csv", index=False)
+    again = load_rssi(tmp_path / "walk.csv", **options)
+    np.testing.assert_allclose(again.receiver_position[:, :2], found.position[:, :2], atol=0.01)
+
+
+def test_baselines_are_the_strongest_row_and_the_mean_weighted_by_power():
+    data = rssi_room(n=60).columns([3])
+    rssi, at = data.rssi_dbm[:, 0].numpy(), data.transmitter_position.numpy()
+    power = np.where(np.isnan(rssi), 0.0, np.power(10.0, np.nan_to_num(rssi) / 10))
+    np.testing.assert_allclose(weighted_centroids(data)[0], (power[:, None] * at).sum(axis=0) / power.sum())
+    np.testing.assert_array_equal(strongest_rows(data)[0], at[np.nanargmax(rssi)])
+
+
+def test_a_receiver_is_on_the_floor_of_its_strongest_mean():
+    """Two floors 4 m apart that take 15 dB; a receiver on each."""
+    draw, n = np.random.default_rng(0), 300
+    storey = np.arange(n) % 2
+    position = np.column_stack([draw.uniform(0, 20, n), draw.uniform(0, 12, n), 1.0 + 4.0 * storey])
+    at, of = np.array([[5.0, 5.0, 2.0], [15.0, 8.0, 6.0]]), np.array([0, 1])
+    distance = np.linalg.norm(position[:, None] - at, axis=2)
+    rssi = -40 - 25 * np.log10(distance) - 15 * (storey[:, None] != of) + draw.normal(0, 2, (n, 2))
+    found = locate_receivers(Rssi(rssi, position, floors=Floors(("0", "1"), (1.0, 5.0))))
+    assert [0 <= float(z) - low <= 2 for z, low in zip(found.position[:, 2], (1.0, 5.0), strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize(("mass", "is_outside"), [(0.04, False), (0.45, False), (0.55, True)])
+def test_outside_is_more_probable_than_inside(floor, mass, is_outside):
+    _, found = floor
+    assert bool(replace(found, outside=torch.tensor([mass])).is_outside) is is_outside
 
 
 def test_data_without_an_unknown_position_are_refused():
