@@ -48,6 +48,17 @@ def test_scans_in_a_gap_have_no_position(tmp_path):
     np.testing.assert_allclose(data.transmitter_position[:, 0], at[(at <= 28.5) | (at >= 61.5)], atol=1e-6)
 
 
+def test_scans_long_before_or_after_the_track_have_no_position(tmp_path):
+    at = write(tmp_path)
+    scan = pd.read_csv(tmp_path / "scan.csv")
+    for seconds in (-60, -5, 95, 160):
+        late = {"timestamp": START + pd.to_timedelta(seconds, unit="s"), "bssid": "a", "rssi": -50 + seconds / 10}
+        scan = pd.concat([scan, pd.DataFrame([late])], ignore_index=True)
+    scan.to_csv(tmp_path / "scan.csv", index=False)
+    data = load_rssi(tmp_path)
+    np.testing.assert_allclose(np.sort(data.transmitter_position[:, 0]), [0.0, *at, 90.0], atol=1e-6)
+
+
 def test_a_track_in_gpx_beside_scans(tmp_path):
     at = write(tmp_path, 2.0, as_gpx=True)
     data = load_rssi(tmp_path)
