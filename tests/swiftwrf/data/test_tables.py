@@ -679,6 +679,18 @@ def test_packets_are_joined_in_windows(unit, cycle):
     np.testing.assert_allclose(data.transmitter_position[0, :2], log[["x", "y"]][:4].mean(), atol=1e-9)
 
 
+def test_rows_of_two_devices_in_one_window_stay_apart():
+    row = np.arange(60)
+    log = pd.DataFrame(
+        {"time": row / 4, "x": row / 4 + 100 * (row % 2), "y": row % 7, "device": np.array(["a", "b"])[row % 2]}
+    )
+    data = Rssi.from_frame(log.assign(ap1=-50.0 - row % 11, ap2=-60.0 - row % 5), window=2.0, offset_by="device")
+    x = data.transmitter_position[:, 0].numpy()
+    assert len(data) < 20
+    assert ((x > 90) == (data.groups == "b")).all()
+    assert ((x < 20) | (x > 99)).all()
+
+
 @pytest.mark.parametrize("long", [False, True])
 def test_sessions_of_a_table(table, long):
     """Packets of two sessions at one position do not share a row."""
