@@ -140,6 +140,8 @@ class RssiTaskConfig(ReadingConfig):
     """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
     above: tuple[float, ...] = ()
     """thresholds of the coverage [dBm], the first one that of the maps (default: -67 for Wi-Fi, else -75)"""
+    below: tuple[float, ...] = ()
+    """thresholds of another quantity than RSSI where smaller is better, e.g. latency, in its unit; in place of --above"""
     rooms: str | None = None
     """rooms as polygons: GeoJSON, or a table of their corners with columns room, x, y and floor (default: rooms.csv or
     rooms.geojson beside the data)"""
@@ -164,6 +166,8 @@ class RssiTaskConfig(ReadingConfig):
         super().check()
         for name in self.also:
             RSSI_PREDICTORS.check(name)
+        if self.above and self.below:
+            raise InputError("--above and --below exclude each other; give the one whose side is good")
         self.check_read()
         if self.floor_plan is None and self.floor_extent is not None:
             raise InputError("--floor-extent needs --floor-plan FILE")

@@ -38,6 +38,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     if isinstance(data, Stations):
         config.check_stations()
     else:
+        data.check_power("a locator")
         how = None if config.data is None else reading(config, config.data)
         rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:

@@ -59,7 +59,7 @@ class RssiPage:
         self._placing: dict[str, ui.number] = {}
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
-            kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
+            kinds = {kind: {**KIND_LABELS, "RSSI": view.model.quantity}.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value=view.kinds[0], on_change=self._update).props(
                 "no-caps padding='2px 12px'"
             )
@@ -90,7 +90,9 @@ class RssiPage:
                 self._height = slider("height", low, high, round(middle, 2), "m", self._update, step=0.01)
             column.set_visibility(high > low)
         with ui.column().classes("w-full gap-0") as self._limits:
-            self._threshold = slider("above", -110, -30, self._view.threshold, "dBm", self._update)
+            low, high, step = self._view.limits
+            name, value, unit = self._view.direction, self._view.threshold, self._view.unit
+            self._threshold = slider(name, low, high, value, unit, self._update, step)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
             numbers = {0: "at this receiver", 1: "at any receiver"}
             numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}

@@ -16,7 +16,7 @@ from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rooms import Rooms
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, at_least, classified, reach
+from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, at_least, classified, passing, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
@@ -26,7 +26,12 @@ MAX_SPOTS = 100  # rows of a floor and threshold in the table of weak spots
 
 
 def maps_and_coverage(
-    model: RssiModel | PairModel, train: Rssi, test: Rssi, thresholds_dbm: Sequence[float], rooms: Rooms | None = None
+    model: RssiModel | PairModel,
+    train: Rssi,
+    test: Rssi,
+    thresholds_dbm: Sequence[float],
+    rooms: Rooms | None = None,
+    below: bool = False,
 ) -> tuple[dict[str, NDArray[Any]], list[Values], dict[str, DataFrame]]:
     """Return maps of each floor, their coverage, and tables of it.
 
@@ -38,6 +43,7 @@ def maps_and_coverage(
         test: Test rows without offsets between groups, whose scans are counted.
         thresholds_dbm: Thresholds of the coverage. Maps are those of the first one.
         rooms: Rooms whose coverage is given in a table `rooms`, at any receiver.
+        below: True where smaller is better; see `Coverage.of`.
 
     Returns:
         Arrays (floors, R, H, W) or (floors, H, W) by name; `Coverage.values` of each floor, at the first threshold and any
@@ -62,13 +68,15 @@ def maps_and_coverage(
         scans, held_out = train[of_row == number], test[of_test == number]
         detected = RssiMap.predict(model, height=height, detected=True)
         for threshold in thresholds_dbm:
-            best, *_ = of_floor = _coverages(model, detected, scans, held_out, threshold)
+            best, *_ = of_floor = _coverages(model, detected, (scans, held_out), threshold, below)
             first += [best[0]] if threshold == thresholds_dbm[0] else []
             found += [{"floor": name} | row for _, row in of_floor]
             of_rooms += [] if rooms is None else _of_rooms(rooms, detected, best[0])
             spots = best[0].weak_spots(detected).head(MAX_SPOTS).round(3)
             degrees = degree_columns(train.origin, spots[["x_m", "y_m"]].to_numpy())
-            tables.append(spots.assign(**degrees, floor=name, threshold_dbm=threshold))
+            tables.append(
+                spots.assign(**degrees, floor=name, threshold_dbm=threshold, direction=best[0].values["direction"])
+            )
     lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
     maps: dict[str, NDArray[Any]] = {
         "x": charts[0].x,
@@ -106,18 +114,22 @@ def _of_rooms(rooms: Rooms, chart: RssiMap, coverage: Coverage) -> list[Values]:
                 kind.replace(" ", "_"): float((measured == CLASSES.index(kind)).mean()) if len(measured) else None
                 for kind in reversed(CLASSES[1:])
             }
-            row: Values = {"room": name, "threshold_dbm": coverage.values["threshold_dbm"]}
+            row: Values = {"room": name} | {key: coverage.values[key] for key in ("threshold_dbm", "direction")}
             row |= {"area_m2": len(of_room) * chart.cell**2, "not_measured": float((of_room == 0).mean())} | shares
-            strongest = chart.mean[:, within[..., room]].mean(axis=1).argmax()
-            found.append(row | {"best_receiver": chart.receiver_names[strongest]})
+            of_receiver = chart.mean[:, within[..., room]].mean(axis=1)
+            best = of_receiver.argmin() if coverage.values["direction"] == "below" else of_receiver.argmax()
+            found.append(row | {"best_receiver": chart.receiver_names[best]})
     return found
 
 
 def _coverages(
-    model: RssiModel | PairModel, chart: RssiMap, scans: Rssi, held_out: Rssi, threshold_dbm: float
+    model: RssiModel | PairModel, chart: RssiMap, parts: tuple[Rssi, Rssi], threshold_dbm: float, below: bool
 ) -> list[tuple[Coverage, Values]]:
-    """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans."""
-    names, found, fields, distance = chart.receiver_names, [], None, reach(model)
+    """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans.
+
+    The parts are the scans and the test rows on the floor.
+    """
+    names, found, fields, distance, (scans, held_out) = chart.receiver_names, [], None, reach(model), parts
     if len(held_out) and not held_out.receiver_moves:
         prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
         assert prediction.std is not None
@@ -127,14 +139,14 @@ def _coverages(
     chosen += [(name, [column], 1) for column, name in enumerate(names)]
     for receiver, columns, number in chosen:
         part = chart if columns == every else chart.receivers([names[column] for column in columns])
-        coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance)
+        coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance, below)
         row: Values = {"receiver": receiver} | coverage.values
         if fields is not None:
             mean, std, detection = (field[columns] for field in fields)
-            above = (held_out.rssi_dbm[:, columns] > threshold_dbm).sum(dim=1) >= number
+            above = passing(held_out.rssi_dbm[:, columns], threshold_dbm, number, below)
             row |= {
                 "n_test": len(held_out),
-                "test_predicted": float(at_least(number, mean, std, detection, threshold_dbm).mean()),
+                "test_predicted": float(at_least(number, mean, std, detection, threshold_dbm, below=below).mean()),
                 "test_above": float(above.double().mean()),
             }
         found.append((coverage, row))

@@ -33,7 +33,7 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.coverage import default_threshold
+from swiftwrf.rssi.coverage import default_threshold, smaller_is_better
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
@@ -59,6 +59,7 @@ class RssiComparison(Comparison):
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
+        below: Thresholds where smaller is better, e.g. of latency, in place of `above`.
         region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
         rooms: Rooms whose coverage is recorded.
 
@@ -78,6 +79,7 @@ class RssiComparison(Comparison):
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
     above: tuple[float, ...] = ()
+    below: tuple[float, ...] = ()
     region: Mapping[str, float] = field(default_factory=dict)
     rooms: Rooms | None = None
 
@@ -89,7 +91,13 @@ class RssiComparison(Comparison):
     def thresholds(self) -> tuple[tuple[float, ...], str | None]:
         """Thresholds of the coverage [dBm], the first one that of maps, and the reason for a default."""
         default, reason = default_threshold(self.train)
-        return (self.above, None) if self.above else ((default,), reason)
+        given = self.above or self.below
+        return (given, None) if given else ((default,), reason)
+
+    @property
+    def is_below(self) -> bool:
+        """True if values below the thresholds are covered: those of `below`, or the default where smaller is better."""
+        return bool(self.below) or (not self.above and smaller_is_better(self.train.quantity))
 
     @cached_property
     def predictions(self) -> DataFrame:
@@ -158,7 +166,8 @@ class RssiComparison(Comparison):
     def recorded(self) -> Recorded:
         recorded, attenuation = super().recorded(), self._fitted.attenuation
         test = self.test if self.train.offsets is None else self.train.offsets.removed(self.test)
-        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, self.thresholds[0], self.rooms)
+        covered = self.thresholds[0], self.rooms, self.is_below
+        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, *covered)
         at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
             "left_out": self.left_out,
@@ -224,6 +233,7 @@ def compare(
     validation: Validation | Literal["auto"] = "auto",
     fewer: Sequence[Fraction] = (),
     above: Sequence[float] = (),
+    below: Sequence[float] = (),
     rooms: Rooms | None = None,
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
@@ -246,6 +256,7 @@ def compare(
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
             split both then predict a region of the training rows by all others.
         above: Thresholds of the coverage [dBm], the first one that of maps. Defaults to -67 for Wi-Fi, else -75.
+        below: Thresholds of another quantity than RSSI, where smaller is better, e.g. latency; in place of `above`.
         rooms: Rooms whose coverage is recorded; see `swiftwrf.data.rooms.read_rooms`.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
@@ -264,7 +275,11 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    given = {name: value for name, value in locals().items() if name not in ("above", "rooms")}  # which change no step
+    given = {
+        name: value for name, value in locals().items() if name not in ("above", "below", "rooms")
+    }  # which change no step
+    if below and (above or data.is_power):
+        raise InputError("below is for another quantity than RSSI, e.g. latency, in place of above; use above")
     chosen = data.as_measured().receivers(receivers)
     small = is_small(chosen, split)
     train, test = (chosen, chosen) if small else chosen.split(split, seed)
@@ -288,7 +303,7 @@ def compare(
             )
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
-    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), rooms=rooms)
+    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), below=tuple(below), rooms=rooms)
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 

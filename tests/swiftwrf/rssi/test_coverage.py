@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.path import Path
+from pandas.testing import assert_frame_equal
 from scipy.integrate import quad
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
@@ -156,6 +157,29 @@ def _hull(points):
                 best = candidate
         corners.append(best)
     return corners
+
+
+def test_below_a_threshold_is_the_mirror_image_of_above():
+    """Of all that is in a coverage and its weak spots, by changing the sign of map, scans and threshold."""
+    generator = np.random.default_rng(7)
+    x, y = np.arange(0.5, 12), np.arange(0.5, 9)
+    mean, std = generator.normal(40, 12, (2, 9, 12)).astype(np.float32), np.full((2, 9, 12), 3.0, np.float32)
+    at, values = np.c_[generator.random((40, 2)) * (11, 8), np.zeros(40)], generator.normal(40, 12, (40, 2))
+    values[generator.random((40, 2)) < 0.2] = math.nan  # lost requests pass neither way
+    found = []
+    for sign in (1, -1):
+        chart = RssiMap(x, y, 0.0, 1.0, sign * mean, std, np.ones_like(std), ("a", "b"), quantity="latency", unit="ms")
+        scans = Rssi(sign * values, at, quantity="latency", unit="ms")
+        coverage = Coverage.of(chart, scans, (sign * 45.0, 0.9, 1), 2.0, below=sign < 0)
+        spots = coverage.weak_spots(chart)
+        assert len(spots)
+        shares = {name: value for name, value in coverage.values.items() if name not in ("threshold_dbm", "direction")}
+        found.append((coverage.probability, spots, shares))
+    (above, spots, shares), (below, mirrored, of_mirror) = found
+    np.testing.assert_allclose(above, below)
+    assert_frame_equal(spots, mirrored)
+    assert shares == of_mirror
+    assert shares["scans_above"] == np.mean(np.nanmax(np.c_[values, np.full(40, -999)], axis=1) > 45)
 
 
 def test_a_scan_at_the_threshold_is_not_above_it():
