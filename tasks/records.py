@@ -35,6 +35,7 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "training",
     "receiver",
     "floor",
+    "band",
     "room",
     "truth_room",
     "synthesizer",

@@ -43,6 +43,18 @@ def why(run: Records) -> str:
     )
 
 
+def bands_sentence(run: Records) -> str:
+    """Return the coverage of each band at the first threshold; empty without bands."""
+    found, several = run.metrics.get("bands", []), len(run.metrics["coverage"]) > 1
+    first = run.metrics["coverage"][0]["threshold_dbm"]
+    shares = [
+        f"{row['covered']:.0%} by {row['band']}" + (f" on {row['floor']}" if several else "")
+        for row in found
+        if row["threshold_dbm"] == first and row["covered"] is not None
+    ]
+    return f"The measured area is covered to {', '.join(shares)}." if shares else ""
+
+
 def held_out_sentence(run: Records) -> str:
     """Return how many test scans pass at the first threshold, beside the prediction; empty without test scans."""
     table = run.table("coverage")
@@ -89,6 +101,8 @@ def section(run: Records) -> Section:
     of_one = ~every["receiver"].isin([ANY, TWO])
     if run.metrics["rooms"]:
         tables.append(_rooms(run.table("rooms"), limit))
+    if run.metrics.get("bands"):
+        tables.append(_table(run.table("bands"), several, limit, by="band"))
     found = Section("", [*filter(None, [why(run)])], tables)
     if of_one.all():
         found.tables.append(_table(every, several, limit))
@@ -124,7 +138,7 @@ def _spots(floors: Sequence[Maps]) -> Table:
     return Table(["", *(["floor"] if floors[0].suffix else []), *heads], rows, caption)
 
 
-def _table(table: DataFrame, several: bool, limit: str) -> Table:
+def _table(table: DataFrame, several: bool, limit: str, by: str = "receiver") -> Table:
     columns = {
         "covered": "covered",
         "not_covered": "not covered",
@@ -137,7 +151,7 @@ def _table(table: DataFrame, several: bool, limit: str) -> Table:
     columns = {name: head for name, head in columns.items() if name in table}
     rows = [
         [
-            row["receiver"],
+            row[by],
             *([str(row["floor"])] if several else []),
             f"{row['threshold_dbm']:g}",
             *("-" if row[name] != row[name] or row[name] is None else f"{row[name]:.0%}" for name in columns),
@@ -149,7 +163,9 @@ def _table(table: DataFrame, several: bool, limit: str) -> Table:
         "second-best receiver is beyond it, too, as roaming needs. Not measured: part of the area between the scans. Test "
         "scans took no part in the fit. `coverage.csv` contains the same."
     )
-    heads = ["receiver", *(["floor"] if several else []), limit, *columns.values()]
+    if by == "band":
+        caption = "Coverage by band: a scan has at least one receiver of the band beyond the threshold. `bands.csv`."
+    heads = [by, *(["floor"] if several else []), limit, *columns.values()]
     return Table(heads, rows, caption)
 
 

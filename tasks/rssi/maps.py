@@ -113,7 +113,7 @@ class Maps:
 
     @property
     def measurement(self) -> str:
-        """What the coverage counts, in sentences."""
+        """Name of the values that the coverage counts."""
         return "detected packet" if self.unit == "dBm" else "measurement"
 
     @property

@@ -192,7 +192,8 @@ def conclusion(run: Records) -> list[str]:
         f"with {first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} {unit} "
         "(median error).",
         *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
-        *filter(None, [coverage.spots_sentence(floors), coverage.held_out_sentence(run), coverage.why(run)]),
+        *filter(None, [coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
+        *filter(None, [coverage.held_out_sentence(run), coverage.why(run)]),
         *receivers_sentence(run),
         sure,
         compared,

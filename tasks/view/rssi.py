@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -41,7 +42,7 @@ def rows_of_run(file: Path, model: RssiModel) -> Rssi:
     """
     stored = read_npz(file)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
-    return _rows(model, measured, position, receiver)
+    return _rows(model, measured, position, receiver, stored["bands"].tolist() if "bands" in stored else [])
 
 
 def rows_of_model(model: RssiModel) -> Rssi:
@@ -52,12 +53,13 @@ def rows_of_model(model: RssiModel) -> Rssi:
     )
 
 
-def _rows(model: RssiModel, measured: Numbers, position: Numbers, receiver: Numbers) -> Rssi:
+def _rows(model: RssiModel, measured: Numbers, position: Numbers, receiver: Numbers, bands: Sequence[str] = ()) -> Rssi:
     return Rssi(
         measured,
         position,
         receiver_position=receiver,
         receiver_names=model.receiver_names,
+        bands=bands or None,
         quantity=model.quantity,
         unit=model.unit,
     )
@@ -74,6 +76,7 @@ class MapSelection:
     certainty: float = 0.9  # required probability that a measurement passes the threshold, in (0, 1)
     row: int = 0  # row whose posterior is shown, counted from 0
     at_least: int = 0  # number of receivers of the coverage; 0 for that of the selected receiver
+    band: str = ""  # band of the receivers of the coverage, empty for all
 
 
 @dataclass(frozen=True)
@@ -279,6 +282,8 @@ class RssiView:
 
     def _who(self, selection: MapSelection) -> str:
         """Return the receivers of the selected coverage, in words."""
+        if selection.band:
+            return f"one of {len(self.rows.receivers_by_band[selection.band])} receivers of {selection.band}"
         names = {0: self.receivers[selection.receiver], 1: f"one of {len(self.receivers)} receivers"}
         return names.get(selection.at_least, f"at least {selection.at_least} receivers")
 
@@ -294,7 +299,10 @@ class RssiView:
         """Return the selected coverage, in the cells of a map of detected packets if one is given; see `map`."""
         chart = chart or self.map(selection.height, counted, detected=True)
         scans, number = self.rows.subset(self.on_floor(selection.height)), selection.at_least
-        if number == 0:
+        if selection.band:
+            columns, number = self.rows.receivers_by_band[selection.band], 1
+            chart, scans = chart.receivers([self.receivers[column] for column in columns]), scans.columns(columns)
+        elif number == 0:
             chart, scans = chart.receivers([self.receivers[selection.receiver]]), scans.columns([selection.receiver])
         limits = selection.threshold, selection.certainty, max(number, 1)
         return Coverage.of(chart, scans, limits, reach(self.model), self.below)

@@ -94,7 +94,8 @@ class RssiPage:
             name, value, unit = self._view.direction, self._view.threshold, self._view.unit
             self._threshold = slider(name, low, high, value, unit, self._update, step)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
-            numbers = {0: "at this receiver", 1: "at any receiver"}
+            numbers: dict[int | str, str] = {0: "at this receiver", 1: "at any receiver"}
+            numbers |= {band: f"at any receiver of {band}" for band in self._view.rows.receivers_by_band}
             numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
             numbers = numbers if len(names) > 1 else {0: numbers[0]}
             self._at_least = ui.select(numbers, value=int(len(names) > 1), on_change=self._update)
@@ -140,8 +141,10 @@ class RssiPage:
         height, certainty = round(self._height.value, 3), self._certainty.value / 100
         locating, number = self._view.locating, self._row.value
         row = 0 if locating is None or number is None else locating.numbered(number)
+        chosen = self._at_least.value  # a number of receivers, or a band
+        number, band = (1, chosen) if isinstance(chosen, str) else (chosen, "")
         return MapSelection(
-            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, self._at_least.value
+            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, number, band
         )
 
     def _update(self) -> None:

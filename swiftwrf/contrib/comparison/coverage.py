@@ -47,7 +47,8 @@ def maps_and_coverage(
 
     Returns:
         Arrays (floors, R, H, W) or (floors, H, W) by name; `Coverage.values` of each floor, at the first threshold and any
-        receiver; tables `coverage`, with a row for each floor, threshold and receiver, and `weak_spots`.
+        receiver; tables `coverage`, with a row for each floor, threshold and receiver, `weak_spots`, and, with bands of the
+        receivers, `bands`, with a row for each floor, threshold and band.
 
     Example:
         >>> import swiftwrf
@@ -63,7 +64,7 @@ def maps_and_coverage(
         for rows in (train, test)
     )
     charts = [RssiMap.predict(model, height=height) for height in heights]
-    found, tables, first, of_rooms = [], [], [], []
+    found, tables, first, of_rooms = list[Values](), [], [], []
     for number, (name, height) in enumerate(zip(names, heights, strict=True)):
         scans, held_out = train[of_row == number], test[of_test == number]
         detected = RssiMap.predict(model, height=height, detected=True)
@@ -91,12 +92,15 @@ def maps_and_coverage(
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
+        "bands": np.array(train.bands or ()).astype(np.str_),
         "floor_names": np.array(names),
         "floor_of_row": of_row.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
     of_floors = [{"floor": name} | floor.values for name, floor in zip(names, first, strict=True)]
-    every = {"coverage": DataFrame(found), "weak_spots": concat(tables, ignore_index=True)}
+    of_receivers, of_bands = ([row for row in found if key in row] for key in ("receiver", "band"))
+    every = {"coverage": DataFrame(of_receivers), "weak_spots": concat(tables, ignore_index=True)}
+    every |= {"bands": DataFrame(of_bands)} if of_bands else {}
     return maps, of_floors, every if rooms is None else every | {"rooms": DataFrame(of_rooms)}
 
 
@@ -125,9 +129,9 @@ def _of_rooms(rooms: Rooms, chart: RssiMap, coverage: Coverage) -> list[Values]:
 def _coverages(
     model: RssiModel | PairModel, chart: RssiMap, parts: tuple[Rssi, Rssi], threshold_dbm: float, below: bool
 ) -> list[tuple[Coverage, Values]]:
-    """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans.
+    """Return the coverage of any, of two and of each receiver and by band, with the predicted and counted test scans.
 
-    The parts are the scans and the test rows on the floor.
+    The parts are the scans and the test rows on the floor. That of a band is that of any of its receivers.
     """
     names, found, fields, distance, (scans, held_out) = chart.receiver_names, [], None, reach(model), parts
     if len(held_out) and not held_out.receiver_moves:
@@ -135,12 +139,13 @@ def _coverages(
         assert prediction.std is not None
         fields = prediction.mean.T, prediction.std.T, detection.T
     every = list(range(len(names)))
-    chosen = [(ANY, every, 1), (TWO, every, 2)] if len(names) > 1 else []
-    chosen += [(name, [column], 1) for column, name in enumerate(names)]
-    for receiver, columns, number in chosen:
+    chosen = [("receiver", ANY, every, 1), ("receiver", TWO, every, 2)] if len(names) > 1 else []
+    chosen += [("receiver", name, [column], 1) for column, name in enumerate(names)]
+    chosen += [("band", name, columns, 1) for name, columns in scans.receivers_by_band.items()]
+    for kind, which, columns, number in chosen:
         part = chart if columns == every else chart.receivers([names[column] for column in columns])
         coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance, below)
-        row: Values = {"receiver": receiver} | coverage.values
+        row: Values = {kind: which} | coverage.values
         if fields is not None:
             mean, std, detection = (field[columns] for field in fields)
             above = passing(held_out.rssi_dbm[:, columns], threshold_dbm, number, below)

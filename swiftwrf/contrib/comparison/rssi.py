@@ -182,6 +182,7 @@ class RssiComparison(Comparison):
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
             "threshold": self.thresholds[1],
+            "bands": tables["bands"].to_dict("records") if "bands" in tables else [],
             "rooms": [] if self.rooms is None else list(self.rooms.names),
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
             "region": dict(self.region),

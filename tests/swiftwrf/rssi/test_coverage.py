@@ -160,7 +160,7 @@ def _hull(points):
 
 
 def test_below_a_threshold_is_the_mirror_image_of_above():
-    """Of all that is in a coverage and its weak spots, by changing the sign of map, scans and threshold."""
+    """Coverage and weak spots are equal if map, scans and threshold change their signs."""
     generator = np.random.default_rng(7)
     x, y = np.arange(0.5, 12), np.arange(0.5, 9)
     mean, std = generator.normal(40, 12, (2, 9, 12)).astype(np.float32), np.full((2, 9, 12), 3.0, np.float32)
