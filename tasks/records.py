@@ -44,7 +44,8 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "measured_fraction",  # a key, whose last digit counts
     "mix",
 )
-IN_DBM, IN_DB = ("measured", "predicted", "threshold"), ("abs_error", "missing", "width")  # columns of runs of RSSI
+IN_DBM = ("measured", "predicted", "threshold")  # columns of runs of RSSI in dBm, and in dB
+IN_DB = ("abs_error", "missing", "width", "median_abs_error", "mean_abs_error")
 DECIMALS = {"m": 3, "db": 2, "dbm": 2, "deg": 4}  # of numbers, by the unit at the end of a column's name
 DEGREE_DECIMALS = 8  # of latitude and longitude: 1 mm
 SIGNIFICANT_DIGITS = 4  # of magnitudes

@@ -66,6 +66,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 validation=config.validation,
                 reference=how.reference if how else None,
                 fewer=FEWER,
+                repeats=config.repeats,
                 above=config.above,
                 below=config.below,
                 rooms=rooms,

@@ -118,8 +118,8 @@ def _maps(run: Records, kind: str) -> Section:
 def _errors(run: Records, found: Answer) -> Section:
     caption = (
         f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
-        "as such; 0.5 is chance."
+        "interval over test places. Over splits: mean and standard deviation of the median error. Detection: mean of the "
+        "fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
     )
     section = errors_section(
         found,
@@ -145,6 +145,8 @@ def answer(run: Records) -> Answer:
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
         cells = {f"{own} minus it [{unit}]": difference(errors, own, name)}
+        if (over := run.metrics.get("repeats", {}).get(name)) is not None:
+            cells[f"over {over['n']:.0f} splits [{unit}]"] = f"{over['median_mean']:.2f} ± {over['median_std']:.2f}"
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
         methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
@@ -195,9 +197,21 @@ def conclusion(run: Records) -> list[str]:
         *filter(None, [coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
         *filter(None, [coverage.held_out_sentence(run), coverage.why(run)]),
         *receivers_sentence(run),
+        *repeats_sentence(run),
         sure,
         compared,
     ]
+
+
+def repeats_sentence(run: Records) -> list[str]:
+    """Return mean and standard deviation over splits of the median errors of the model and the best baseline."""
+    found, names, unit = run.metrics.get("repeats", {}), (model_of(run), best_baseline(run)), Maps(run).error_unit
+    over = [
+        f"{name} {found[name]['median_mean']:.2f} {unit} (standard deviation {found[name]['median_std']:.2f})"
+        for name in names
+        if name in found
+    ]
+    return [f"Median errors over {found[names[0]]['n']:.0f} splits: {', '.join(over)}."] if over else []
 
 
 def steps(run: Records) -> list[NextStep]:
