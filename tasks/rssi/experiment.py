@@ -46,6 +46,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
+    source |= rooms.source if rooms else {}
 
     def described(value: Row) -> str:
         return f"{value['median']:.2f} {difference_unit(whole.unit)}" if "median" in value else ""
