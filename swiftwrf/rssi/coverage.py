@@ -23,13 +23,13 @@ from pandas import DataFrame
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
-from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.positions import inside
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.scans import at_least, passing
 
 WIFI_DBM, OTHER_DBM = -67.0, -75.0  # usual thresholds: voice over Wi-Fi; BLE and others
 CERTAINTY = 0.9  # probability from which a cell is covered
@@ -67,60 +67,6 @@ def smaller_is_better(quantity: str) -> bool:
         [True, True, False, False]
     """
     return bool(SMALLER.search(quantity)) and "signal" not in quantity.lower()
-
-
-def passing(values: Tensor, threshold_dbm: float, number: int = 1, below: bool = False) -> Tensor:
-    """Return which scans have at least a number of R values above a threshold, or `below` it, bool (n,).
-
-    Args:
-        values: Measured values (n, R), nan where there is none.
-        threshold_dbm: Threshold, in the unit of the values.
-        number: Number of receivers, from 1.
-        below: True where smaller is better.
-
-    Example:
-        >>> passing(torch.tensor([[20.0, 60.0], [70.0, torch.nan]]), 50.0, below=True)
-        tensor([ True, False])
-    """
-    return ((values < threshold_dbm) if below else (values > threshold_dbm)).sum(dim=1) >= number
-
-
-def at_least(
-    number: int,
-    mean: Tensor,
-    std: Tensor,
-    detection: Tensor,
-    threshold_dbm: float,
-    correlation: float = 0.2,
-    below: bool = False,
-) -> Tensor:
-    """Return the probability that a scan has at least a number of R receivers above a threshold, float64 (...).
-
-    Args:
-        number: Number of receivers, from 1.
-        mean: Mean of detected packets (R, ...) [dBm].
-        std: Their standard deviation (R, ...) [dB].
-        detection: Probability of a detection (R, ...).
-        threshold_dbm: Threshold.
-        below: True where smaller is better: probability of values below the threshold.
-        correlation: Correlation of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`.
-
-    Example:
-        >>> at_least(1, torch.tensor([-75.0]), torch.tensor([4.0]), torch.tensor([0.8]), -75.0).round(decimals=3)
-        tensor(0.4000, dtype=torch.float64)
-    """
-    z = (-1 if below else 1) * (mean.double() - threshold_dbm) / std.double().clamp_min(1e-6)
-    score = torch.special.ndtri(detection.double() * torch.special.ndtr(z))
-    total = torch.zeros_like(score[0])
-    nodes, weights = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
-    for node, weight in zip(nodes, weights / weights.sum(), strict=True):
-        given = torch.special.ndtr((score + math.sqrt(correlation) * node) / math.sqrt(1 - correlation))
-        counts = [torch.ones_like(total), *(torch.zeros_like(total) for _ in range(number - 1))]
-        for above in given:  # probabilities of 0 to number - 1 receivers
-            fewer = [torch.zeros_like(above), *counts[:-1]]
-            counts = [count * (1 - above) + less * above for count, less in zip(counts, fewer, strict=True)]
-        total += weight * (1 - torch.stack(counts).sum(dim=0))
-    return total
 
 
 def reach(model: RssiModel | PairModel, max_open_variance: float = 0.5, max_widening: float = 1.2) -> float:
@@ -204,7 +150,7 @@ class Coverage:
         """
         (threshold_dbm, certainty, number), scans = limits, scans.about(chart.origin)
         mean, std, detection = (torch.from_numpy(field) for field in (chart.mean, chart.std, chart.detection))
-        probability = at_least(number, mean, std, detection, threshold_dbm, below=below).numpy()
+        probability = at_least(number, mean, std, detection, threshold_dbm, chart.correlation, below).numpy()
         cells, known = np.stack(np.meshgrid(chart.x, chart.y), axis=-1), scans.transmitter_position[:, :2].numpy()
         enclosed = inside(cells, known) if len(known) else np.zeros(probability.shape, dtype=bool)
         measured = enclosed & (cKDTree(known).query(cells)[0] <= reach)

@@ -16,10 +16,11 @@ from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rooms import Rooms
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, at_least, classified, passing, reach
+from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, classified, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.scans import at_least, passing
 
 ANY, TWO = "any receiver", "two receivers"  # of a scan, above the threshold; others are names of receivers
 MAX_SPOTS = 100  # rows of a floor and threshold in the table of weak spots
@@ -138,7 +139,7 @@ def _coverages(
         prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
         assert prediction.std is not None
         fields = prediction.mean.T, prediction.std.T, detection.T
-    every = list(range(len(names)))
+    every, limit = list(range(len(names))), (threshold_dbm, model.scan_correlation, below)
     chosen = [("receiver", ANY, every, 1), ("receiver", TWO, every, 2)] if len(names) > 1 else []
     chosen += [("receiver", name, [column], 1) for column, name in enumerate(names)]
     chosen += [("band", name, columns, 1) for name, columns in scans.receivers_by_band.items()]
@@ -151,7 +152,7 @@ def _coverages(
             above = passing(held_out.rssi_dbm[:, columns], threshold_dbm, number, below)
             row |= {
                 "n_test": len(held_out),
-                "test_predicted": float(at_least(number, mean, std, detection, threshold_dbm, below=below).mean()),
+                "test_predicted": float(at_least(number, mean, std, detection, *limit).mean()),
                 "test_above": float(above.double().mean()),
             }
         found.append((coverage, row))

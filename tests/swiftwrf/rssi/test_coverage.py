@@ -17,9 +17,10 @@ from test_not_detected import RECEIVER, survey
 
 from swiftwrf import PairModel, Rssi, RssiModel, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi.coverage import Coverage, at_least, default_threshold, reach
+from swiftwrf.rssi.coverage import Coverage, default_threshold, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import log_distance
+from swiftwrf.rssi.scans import at_least
 
 MEAN, STD, DETECTED = np.array([-70.0, -78.0, -74.0]), np.array([4.0, 6.0, 5.0]), np.array([0.9, 1.0, 0.6])
 
@@ -262,7 +263,7 @@ def test_held_out_scans_pass_as_predicted():
         detection = model.predict_detection(test.transmitter_position).T
         for quantile in (0.1, 0.3, 0.5):
             threshold = float(strongest.quantile(quantile)) - 0.5
-            predicted.append(at_least(1, *fields, detection, threshold).numpy())
+            predicted.append(at_least(1, *fields, detection, threshold, model.scan_correlation).numpy())
             passed.append((strongest > threshold).numpy())
     predicted, passed = np.stack(predicted), np.stack(passed)
     expected = passed.mean(axis=1).reshape(-1, 3).mean(axis=0)  # of all floors
