@@ -248,8 +248,8 @@ class SharedPathLoss:
             receiver: Positions of the receivers, of which most are estimates.
             spread_db: Prior standard deviation of `fit_path_losses`.
             noises: Compared variances of a measurement relative to that of the field. Smaller ones explain errors of the
-                positions by the field: with 0.03 and 0.1, too, weights of the likelihood fall from 0.67 to 0.45 and 80 % regions
-                hold 56 of 58 receivers in place of 53 (`benchmarks/survey.py receivers`).
+                positions by the field: with 0.03 and 0.1, too, the weight of the likelihood is 0.45 for 0.67, and 80 %
+                regions hold 56 of 58 receivers for 53 (`benchmarks/survey.py receivers`).
         """
         bins = Bins.of(data, RssiConfig(max_locations=300))
         at = receiver - bins.centre

@@ -252,6 +252,26 @@ def test_unknown_positions_of_receivers_leave_the_coverage_as_it_is():
         assert Coverage.of(chart, data, (-75.0, 0.9, 1)).values["covered"] > 0.99
 
 
+def test_coverage_of_receivers_with_common_errors_is_that_of_counted_scans():
+    """Six networks of one access point: 0.2 as correlation predicts 6 points or more too many scans."""
+    generator = np.random.default_rng(5)
+    at = np.c_[generator.random((600, 2)) * (30, 12), np.ones(600)]
+    power = -40 - 25 * np.log10(np.hypot(at[:, 0] - 5, at[:, 1] - 6) + 1) + generator.normal(0, 4.5, 600)
+    rows = Rssi(power[:, None] + generator.normal(0, 2.5, (600, 6)), at)
+    train, test = rows.subset(torch.arange(400)), rows.subset(torch.arange(400, 600))
+    model = RssiModel().fit(train)
+    assert model.scan_correlation >= 0.6
+    found = model.predict_detected(test)
+    fields = found.mean.T, found.std.T, torch.ones_like(found.mean.T)
+    passed = (test.rssi_dbm > -65).any(dim=1).double().mean()
+    chosen, usual = (float(at_least(1, *fields, -65.0, rho).mean() - passed) for rho in (model.scan_correlation, 0.2))
+    assert abs(chosen) < 0.05
+    assert usual > 0.06
+    chart = RssiMap.predict(model, 2.0, detected=True)
+    expected = at_least(1, *map(torch.tensor, (chart.mean, chart.std, chart.detection)), -65.0, model.scan_correlation)
+    np.testing.assert_allclose(Coverage.of(chart, train, (-65.0, 0.9, 1)).probability, expected)
+
+
 def test_held_out_scans_pass_as_predicted():
     """At thresholds that half to nine tenths of the scans pass, on floors that the correlation was not chosen by."""
     predicted, passed = [], []
