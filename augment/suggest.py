@@ -115,7 +115,7 @@ def suggest_positions(locator: RssiLocator, train: Rssi, count: int, seed: int =
     return Suggestion(candidate[chosen], variance)
 
 
-def suggest_scans(model: RssiModel, survey: Rssi, count: int, above_dbm: float) -> Suggestion:
+def suggest_scans(model: RssiModel, survey: Rssi, count: int, above_dbm: float, below: bool = False) -> Suggestion:
     """Return positions to measure next, where the maps are uncertain and so is whether a scan passes the threshold.
 
     The positions are inside of what was walked. Each one lowers the sum of p (1 - p) times the posterior variance of the
@@ -127,6 +127,7 @@ def suggest_scans(model: RssiModel, survey: Rssi, count: int, above_dbm: float) 
         survey: Measured rows.
         count: Number of positions, 1 to 500; fewer are returned if the walked area has fewer cells.
         above_dbm: Threshold of the coverage [dBm].
+        below: True where smaller is better: scans below the threshold pass.
 
     Raises:
         InputError: A number outside 1 to 500.
@@ -150,7 +151,7 @@ def suggest_scans(model: RssiModel, survey: Rssi, count: int, above_dbm: float) 
         scans = survey if floors is None else survey.subset(floors.number(at) == number)
         if len(scans):
             chart = RssiMap.predict(model, edge, height, scans.transmitter_position, detected=True)
-            found = Coverage.of(chart, scans, (above_dbm, 0.9, 1), reach(model))
+            found = Coverage.of(chart, scans, (above_dbm, 0.9, 1), reach(model), below)
             y, x = found.inside.nonzero()
             cells = torch.tensor([(chart.x[i], chart.y[j], chart.height) for i, j in zip(x, y, strict=True)])
             positions.append(cells.reshape(-1, 3).double())

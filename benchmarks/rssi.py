@@ -41,8 +41,9 @@ from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.rssi import RssiModel
-from swiftwrf.rssi.coverage import at_least, default_threshold, reach
+from swiftwrf.rssi.coverage import default_threshold, reach
 from swiftwrf.rssi.head import DB_PER_UNIT, Head, render
+from swiftwrf.rssi.scans import at_least
 
 RESULT = "rssi"
 SPLITS = {
@@ -243,6 +244,7 @@ def predicted_above(model: RssiModel, scans: Rssi, threshold: float, **options: 
     """Return the probability that any receiver of each scan is above a threshold, (n,)."""
     found, detection = model.predict_detected(scans), model.predict_detection(scans.transmitter_position)
     assert found.std is not None
+    options = {"correlation": model.scan_correlation} | options
     return at_least(1, found.mean.T, found.std.T, detection.T, threshold, **options)
 
 

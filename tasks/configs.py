@@ -110,8 +110,17 @@ class AoaConfig(ReadingConfig):
         self.check_read()
         if self.processes is not None and self.scheduler is not None:
             raise InputError("--processes and --scheduler exclude each other; leave out one")
-        if self.seed + self.repeats > SEEDS:
-            raise InputError(f"--seed {self.seed} leaves no seeds for {self.repeats} repeats; choose a smaller one")
+        check_repeats(self.seed, self.repeats)
+
+
+def check_repeats(seed: int, repeats: int) -> None:
+    """Refuse a seed that leaves too few seeds for repeats.
+
+    Raises:
+        InputError: The seed of the last repeat is too large.
+    """
+    if seed + repeats > SEEDS:
+        raise InputError(f"--seed {seed} leaves no seeds for {repeats} repeats; choose a smaller one")
 
 
 @options
@@ -140,6 +149,8 @@ class RssiTaskConfig(ReadingConfig):
     """folds of the training rows that choose all settings; auto takes those that are like the test rows"""
     above: tuple[float, ...] = ()
     """thresholds of the coverage [dBm], the first one that of the maps (default: -67 for Wi-Fi, else -75)"""
+    below: tuple[float, ...] = ()
+    """thresholds of another quantity than RSSI where smaller is better, e.g. latency, in its unit; in place of --above"""
     rooms: str | None = None
     """rooms as polygons: GeoJSON, or a table of their corners with columns room, x, y and floor (default: rooms.csv or
     rooms.geojson beside the data)"""
@@ -151,6 +162,8 @@ class RssiTaskConfig(ReadingConfig):
     """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
     """number of positions to suggest for the next measurements, those that make the coverage more certain"""
+    repeats: PositiveInt = 1
+    """number of random splits, over which errors have a mean and a standard deviation"""
     scheduler: str | None = None
     """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: Seed = 0
@@ -164,6 +177,9 @@ class RssiTaskConfig(ReadingConfig):
         super().check()
         for name in self.also:
             RSSI_PREDICTORS.check(name)
+        check_repeats(self.seed, self.repeats)
+        if self.above and self.below:
+            raise InputError("--above and --below exclude each other; give the one whose side is good")
         self.check_read()
         if self.floor_plan is None and self.floor_extent is not None:
             raise InputError("--floor-extent needs --floor-plan FILE")

@@ -77,6 +77,8 @@ def survey_of(records: Records) -> tuple[RssiModel, Rssi]:
     if records.config.get("task") != "rssi" or not maps or not file.is_file():
         raise InputError(f"{records.folder} is no run of swiftwrf rssi; run {command('rssi', '--rx', 'all')} first")
     model = load(file)
+    if records.metrics["unit"] != "dBm":
+        raise InputError(f"{records.folder} is a run of {records.metrics['quantity']}; a plan needs a run of RSSI")
     if not isinstance(model, RssiModel):
         raise InputError(f"{records.folder} has receivers that move; a plan is for access points at fixed places")
     receiver = model.receiver_position.clone()

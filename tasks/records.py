@@ -35,6 +35,7 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "training",
     "receiver",
     "floor",
+    "band",
     "room",
     "truth_room",
     "synthesizer",
@@ -43,6 +44,8 @@ NAMES = (  # columns of text, even if a cell reads NA, 1 or 12:34
     "measured_fraction",  # a key, whose last digit counts
     "mix",
 )
+IN_DBM = ("measured", "predicted", "threshold")  # columns of runs of RSSI in dBm, and in dB
+IN_DB = ("abs_error", "missing", "width", "median_abs_error", "mean_abs_error")
 DECIMALS = {"m": 3, "db": 2, "dbm": 2, "deg": 4}  # of numbers, by the unit at the end of a column's name
 DEGREE_DECIMALS = 8  # of latitude and longitude: 1 mm
 SIGNIFICANT_DIGITS = 4  # of magnitudes
@@ -172,11 +175,30 @@ def read_npz(file: Path) -> dict[str, NDArray[Any]]:
 
 def write_result(result: Recorded, folder: Path) -> Row:
     """Write the tables and arrays of a result into a folder, and return the content of metrics.json."""
+    columns = file_columns(dict(result.metrics))
     for name, table in result.tables.items():
-        write_table(folder / f"{name}.csv", table)
+        write_table(folder / f"{name}.csv", table.rename(columns=columns))
     for name, arrays in result.arrays.items():
         write_npz(folder / f"{name}.npz", arrays)
     return dict(result.metrics)
+
+
+def file_columns(metrics: Row) -> dict[str, str]:
+    """Return the names that columns in dBm and dB have in the files of a run, by its quantity and direction.
+
+    Example:
+        >>> file_columns({"unit": "ms", "coverage": [{"direction": "below"}]})["scans_above"]
+        'scans_below'
+    """
+    from swiftwrf.models.prediction import difference_unit, suffix
+
+    unit = metrics.get("unit", "dBm")
+    names = {f"{name}_dbm": f"{name}_{suffix(unit)}" for name in IN_DBM}
+    names |= {f"{name}_db": f"{name}_{suffix(difference_unit(unit))}" for name in IN_DB}
+    coverage = metrics.get("coverage")
+    if isinstance(coverage, list) and coverage and coverage[0].get("direction") == "below":
+        names |= {name: name.replace("above", "below") for name in ("above", "scans_above", "test_above")}
+    return names
 
 
 def notes(run: Records) -> list[str]:
@@ -245,8 +267,13 @@ class Records:
     def table(self, name: str) -> pd.DataFrame:
         """One of the run's tables, e.g. `errors`; not to be changed."""
         if name not in self._tables:
-            self._tables[name] = read_table(self.folder / f"{name}.csv")
+            columns = {written: column for column, written in file_columns(self.metrics).items()}
+            self._tables[name] = read_table(self.folder / f"{name}.csv").rename(columns=columns)
         return self._tables[name]
+
+    def in_files(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return a table with the names of columns that the files of the run have; see `file_columns`."""
+        return table.rename(columns=file_columns(self.metrics))
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Return the arrays that the run saved in a file, e.g. `maps`, by their names; none without that file."""

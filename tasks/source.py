@@ -224,7 +224,7 @@ def aligned(data: Rssi, model: RssiModel, ignore_others: bool) -> Rssi:
     columns = [own.index(name) if name in own else len(own) for name in names]  # the last one is of nothing
     rssi = functional.pad(data.rssi_dbm, (0, 1), value=torch.nan)[:, columns]
     position = functional.pad(data.receiver_position, (0, 0, 0, 1), value=torch.nan)[columns]
-    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position)
+    return replace(data, rssi_dbm=rssi, receiver_names=names, receiver_position=position, bands=None)
 
 
 def _read_array(file: Path) -> Tensor:

@@ -19,6 +19,8 @@ CELL_NUMBER = re.compile(r"(?:.*_)?(?:cell_?id|cid|eci|cgi|nci|ci)")  # which is
 PHYSICAL_CELL = re.compile(r"(?:.*_)?(?:pci|psc|physical_cell_?id)")  # which other cells on other carriers have, too
 CARRIER = re.compile(r"(?:.*_)?(?:[eu]?|nr_?)arfcn(?:_?dl)?")
 NETWORK = re.compile(r"(?:.*_)?(?:e?ssid|network(?:_name)?|ap_?(?:name|id)?|access_?point(?:_?(?:name|id))?)")
+WIFI_MHZ = {"2.4 GHz": (2400, 2500), "5 GHz": (5150, 5925), "6 GHz": (5925, 7125)}  # lower and upper end
+WIFI_CHANNELS = {"2.4 GHz": range(1, 15), "5 GHz": (*range(36, 65, 4), *range(100, 145, 4), *range(149, 178, 4))}
 BAND = re.compile(r"(?:.*_)?(?:freq\w*|channel|chan|ch|band|radio)(?:_?(?:mhz|ghz|id|name|no|number))?")
 
 
@@ -32,6 +34,67 @@ def plain_receiver(name: str) -> str:
     words = re.split(r"[\s:._-]+", name.strip().lower())
     plain = "".join(words)
     return plain if re.fullmatch("[0-9a-f]{12}", plain) else re.sub(r"(?<!\d)0+(?=\d)", "", " ".join(words))
+
+
+def band_names(column: str, values: pd.Series) -> pd.Series | None:
+    """Return the bands of values in a column of bands, channels or frequencies as text; None for another column.
+
+    Frequencies and channels of Wi-Fi are those of 2.4 and 5 GHz, frequencies also of 6 GHz, whose channels have the same
+    numbers. Other values are their own bands.
+
+    Example:
+        >>> list(band_names("freq", pd.Series(["2437", "5180", ""]))), list(band_names("channel", pd.Series(["1", "36"])))
+        (['2.4 GHz', '5 GHz', ''], ['2.4 GHz', '5 GHz'])
+    """
+    if not BAND.fullmatch(plain := plain_name(column)):
+        return None
+    known = values[values != ""]
+    number, is_channel = pd.to_numeric(known, errors="coerce").to_numpy(float), "ch" in plain
+    for unit_mhz in (1.0,) if is_channel else (1.0, 1e3, 1e-3, 1e-6):
+        band = np.full(len(known), "", dtype=object)
+        for name, found in (WIFI_CHANNELS if is_channel else WIFI_MHZ).items():
+            mhz = number * unit_mhz
+            band[np.isin(number, found) if is_channel else (mhz >= found[0]) & (mhz < found[1])] = name
+        if (band != "").all():
+            known = pd.Series(band, known.index, dtype=object)
+            break
+    return known.reindex(values.index, fill_value="")
+
+
+def bands_of_receivers(
+    table: pd.DataFrame,
+    packet: NDArray[np.int64],
+    receiver: NDArray[np.int64],
+    n: int,
+    max_bands: int = 12,
+    min_fraction: float = 0.95,
+) -> tuple[str, list[str]] | None:
+    """Return a column of a long table that is the band of its receivers, and the band of each; None without one.
+
+    Args:
+        table: Packets.
+        packet: Rows of the packets that count.
+        receiver: Number of the receiver of each of them.
+        n: Number of receivers.
+        max_bands: Largest number of bands. Not studied.
+        min_fraction: Least fraction of packets with the most frequent band of their receiver. Not studied.
+    """
+    for name in table.columns:
+        if not BAND.fullmatch(plain_name(name)):
+            continue
+        values = band_names(name, text_of(table[name]))
+        assert values is not None
+        each = values.to_numpy()[packet]
+        usual = pd.Series(each).groupby(receiver).agg(lambda one: one.mode().iloc[0]).reindex(range(n), fill_value="")
+        same = (usual.to_numpy()[receiver] == each).mean()
+        if same >= min_fraction and several_bands(usual, max_bands):
+            return name, [str(band) for band in usual]
+    return None
+
+
+def several_bands(bands: pd.Series, max_bands: int = 12) -> bool:
+    """Return True for several bands, fewer than receivers."""
+    return 1 < len({*bands} - {""}) <= min(max_bands, len(bands) - 1)
 
 
 def unknown_ids(receiver: pd.Series) -> NDArray[np.bool_]:

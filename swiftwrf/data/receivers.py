@@ -15,7 +15,7 @@ from swiftwrf.data.cells import Floats, column_of_numbers, text_of
 from swiftwrf.data.columns import GEODETIC, column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, frame_of
 from swiftwrf.data.files import numbers, read_table, read_yaml
-from swiftwrf.data.radios import plain_receiver
+from swiftwrf.data.radios import band_names, plain_receiver, several_bands
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import check_positions
 
@@ -41,8 +41,10 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
 
 def read_receivers(
     file: Path, names: Sequence[str], origin: GeodeticOrigin | None, frame: PlanFrame
-) -> tuple[Tensor, list[str]]:
-    """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, and a note on these.
+) -> tuple[Tensor, list[str] | None, list[str]]:
+    """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, their bands, and notes.
+
+    A table with a column of bands, channels or frequencies may have no positions.
 
     Args:
         file: Table of positions with names of receivers, or without names in the order of the receivers; or YAML with
@@ -62,6 +64,9 @@ def read_receivers(
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
+    bands = _bands(table, listed_names, names)
+    if bands and not any(column_of(table, role, {}) for role in ("x", "y", *GEODETIC.values())):
+        return torch.full((len(names), 3), torch.nan, dtype=torch.float64), bands, notes
     position = positions_of(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]
@@ -72,7 +77,18 @@ def read_receivers(
     positions = torch.tensor([position_of.get(name, [float("nan")] * 3) for name in names], dtype=torch.float64)
     if unknown:
         notes.append(f"the position of these receivers is unknown, so they have no path-loss model: {listed(unknown)}")
-    return positions, notes
+    return positions, bands, notes
+
+
+def _bands(table: pd.DataFrame, listed_names: Sequence[str], names: Sequence[str]) -> list[str] | None:
+    """Return the bands of receivers in the first column that has several of them; None without one."""
+    for column in table.columns:
+        if (found := band_names(column, text_of(table[column]))) is not None:
+            band_of = dict(zip(listed_names, found, strict=True))
+            bands = pd.Series([band_of.get(name, "") for name in names], dtype=object)
+            if several_bands(bands):
+                return [str(band) for band in bands]
+    return None
 
 
 def _positions_by_name(file: Path, names: Sequence[str]) -> pd.DataFrame:

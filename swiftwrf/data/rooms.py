@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from swiftwrf.data.cells import Floats, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame
-from swiftwrf.data.files import read_table, read_text
+from swiftwrf.data.files import digests, read_table, read_text
 from swiftwrf.data.receivers import positions_of
 from swiftwrf.errors import InputError, listed
 from swiftwrf.runtime.checkpoint import refusing
@@ -36,6 +36,7 @@ class Rooms:
         rings: Corners (n, 2) [m] of the closed lines around each room: its outline, and those of holes and further parts.
         floors: Floors of the building. None if there is one only.
         floor: Number of the floor of each room. Defaults to 0.
+        source: sha256 of the file by its name.
 
     Raises:
         InputError: No room, a name twice, or a ring of fewer than three corners.
@@ -50,6 +51,7 @@ class Rooms:
     rings: tuple[tuple[Floats, ...], ...]
     floors: Floors | None = None
     floor: tuple[int, ...] = ()
+    source: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) < len(self.names) or OUTSIDE in self.names:
@@ -152,7 +154,8 @@ def read_rooms(
         room if names.count(room) == 1 or floors is None else f"{room} ({floors.names[number]})"
         for room, number, _ in found
     ]
-    return Rooms(tuple(named), tuple(rings for *_, rings in found), floors, tuple(number for _, number, _ in found))
+    numbers, rings = tuple(number for _, number, _ in found), tuple(rings for *_, rings in found)
+    return Rooms(tuple(named), rings, floors, numbers, digests([file]))
 
 
 def _floor_numbers(file: Path, table: pd.DataFrame, floors: Floors) -> list[int]:

@@ -40,6 +40,7 @@ class Rssi(PositionedData):
         transmitter_position: Positions of the transmitter, (n, 3) [m].
         receiver_position: Positions of the receivers, (R, 3) [m], nan where unknown. Defaults to nan for all.
         receiver_names: Names of the receivers. Defaults to receiver1, receiver2, ...
+        bands: Band of each receiver, by which coverage is given, e.g. 5 GHz; None where it is unknown.
         origin: Latitude and longitude of x = y = 0, if the positions were projected from degrees.
         groups: Name of each row's group, e.g. a device, between which RSSI has constant offsets; named as their column.
         offsets: Offsets that were removed from the RSSI.
@@ -71,6 +72,7 @@ class Rssi(PositionedData):
     transmitter_position: Tensor
     receiver_position: Tensor
     receiver_names: tuple[str, ...]
+    bands: tuple[str, ...] | None
     origin: GeodeticOrigin | None
     groups: pd.Series | None
     offsets: Offsets | None
@@ -94,6 +96,7 @@ class Rssi(PositionedData):
         *,
         receiver_position: Numbers | None = None,
         receiver_names: Sequence[str] | None = None,
+        bands: Sequence[str] | None = None,
         origin: GeodeticOrigin | None = None,
         groups: pd.Series | None = None,
         offsets: Offsets | None = None,
@@ -122,6 +125,8 @@ class Rssi(PositionedData):
             raise InputError(
                 f"{name} has {count} receivers, but the names {listed(names)}; give each receiver one of its own"
             )
+        if bands is not None and len(bands) != count:
+            raise InputError(f"{name} has {count} receivers, but {len(bands)} bands; give one of each receiver")
         if session is not None and not isinstance(session, Tensor):
             session = torch.from_numpy(pd.factorize(np.asarray(session, dtype=object))[0])
         places = torch.full((count, 3), torch.nan) if receiver_position is None else receiver_position
@@ -132,6 +137,7 @@ class Rssi(PositionedData):
             transmitter_position=position,
             receiver_position=to_positions("receiver_position", places, (count, 3), missing=True),
             receiver_names=names,
+            bands=None if bands is None else tuple(bands),
             origin=origin,
             groups=None if groups is None else groups.astype("category"),
             offsets=offsets,
@@ -326,9 +332,16 @@ class Rssi(PositionedData):
         return replace(
             self,
             receiver_names=tuple(self.receiver_names[c] for c in columns),
+            bands=None if self.bands is None else tuple(self.bands[c] for c in columns),
             receiver_position=self.receiver_position[columns],
             rssi_dbm=self.rssi_dbm[:, columns],
         )
+
+    @property
+    def receivers_by_band(self) -> dict[str, list[int]]:
+        """Numbers of the receivers of each band, counted from 0; empty without bands."""
+        bands = self.bands or ()
+        return {name: [i for i, band in enumerate(bands) if band == name] for name in sorted({*bands} - {""})}
 
     def plot(self, receiver: str | None = None, ax: Axes | None = None) -> Axes:
         """Draw the RSSI where it was detected, seen from above, and the known positions of the receivers.

@@ -52,6 +52,7 @@ from swiftwrf.data.powers import (
     without_fillers,
 )
 from swiftwrf.data.radios import (
+    bands_of_receivers,
     pooled,
     pools_by,
     propose_pools,
@@ -103,6 +104,7 @@ class _Survey:
         n_listed: Rows of `table` for each row of the source: the length of its ranked lists, else 1.
         end: Columns of the second end by x, y and z.
         names: Names of the R receivers.
+        bands: Their bands, None without a column of these.
         left_out: Columns of other quantities than the received power.
         relays: Columns that count the relays of a packet, none without these.
         corrected: Column of the transmit power that is subtracted, empty without one.
@@ -131,6 +133,7 @@ class _Survey:
         table, self.n_listed, notes = from_ranked_lists(table, asked)
         self.notes += notes
         self.table, self.names, self.end, self.corrected = table, list[str](), dict[str, str](), ""
+        self.bands: list[str] | None = None
         if len(options.transmitter) == 1:
             asked["receiver"] = options.transmitter[0]
         elif options.transmitter or not {"x", "y"} & asked.keys():
@@ -150,8 +153,6 @@ class _Survey:
         self.relays = [name for name in relay_columns(table) if name not in (*used, *self.roles.values())]
         used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays}
         self.unused = [name for name in table.columns if name not in used]
-        if self.unused:
-            self.notes.append(f"columns that are not used: {listed(self.unused)}")
 
     def form_rows(self) -> None:
         """Form rows of coordinates and RSSI: those of a wide table, or one a time, place and packet of a long one."""
@@ -173,9 +174,16 @@ class _Survey:
             packets = rows_of_packets(self.source, self.table, self.roles["receiver"], power[:, 0], keys, self.n_listed)
             self.names, self.rssi, self.table_row, notes = packets
             self.coordinate, self.notes = self.coordinate[self.table_row.min(axis=1)], self.notes + words + notes
+            at = np.nonzero(~np.isnan(self.rssi))
+            if found := bands_of_receivers(self.table, self.table_row[at], at[1], len(self.names)):
+                name, self.bands = found
+                self.unused = [other for other in self.unused if other != name]
+                self.notes.append(f"bands of receivers are those of column {name}: {listed(dict.fromkeys(self.bands))}")
         else:
             self.rssi, words = powers_in(self.source, self.table, self.names)
             self.table_row, self.notes = np.arange(len(self.table))[:, None], self.notes + words
+        if self.unused:
+            self.notes.append(f"columns that are not used: {listed(self.unused)}")
 
     def clean_powers(self) -> None:
         """Take fillers as not detected, refuse what is no received power, and pool radios."""
@@ -195,6 +203,7 @@ class _Survey:
         if by is not None:
             pools = pools_by(self.source, self.table, self.names, self.roles.get("receiver"), by)
             self.names, self.rssi, notes = pooled(self.rssi, pools, by)
+            self.bands = None
             self.notes += notes
         else:
             self.notes += propose_pools(self.names, self.rssi)
@@ -260,6 +269,7 @@ class _Survey:
         if not kept.all():
             self.notes.append(f"receivers that never detected the transmitter are left out: {int((~kept).sum())}")
         self.names, self.rssi = [self.names[i] for i in np.flatnonzero(kept)], self.rssi[:, kept]
+        self.bands = self.bands and [self.bands[i] for i in np.flatnonzero(kept)]
 
     def find_times(self) -> None:
         """Find the times of rows, and join the rows of each window."""
@@ -309,8 +319,8 @@ class _Survey:
             if moves:
                 raise InputError(f"{self.source} has positions of both ends, which only a model of RSSI takes; {what}")
         elif receivers is not None and receiver_position is None:
-            known, notes = read_receivers(receivers, self.names, self.origin, self.frame)
-            receiver_position = known.numpy()
+            known, bands, notes = read_receivers(receivers, self.names, self.origin, self.frame)
+            receiver_position, self.bands = known.numpy(), bands or self.bands
             self.notes += notes
         group = self.group.iloc[self.table_row].rename(options.offset_by) if options.offset_by else None
         return {
@@ -318,6 +328,7 @@ class _Survey:
             "transmitter_position": self.coordinate,
             "receiver_position": receiver_position,
             "receiver_names": self.names,
+            "bands": None if self.end else self.bands,
             "origin": self.origin,
             "groups": group,
             "labels": labels,

@@ -90,6 +90,7 @@ def write_rssi(data: Rssi, folder: Path) -> None:
         "groups": None if data.groups is None else str(data.groups.name),
         "offsets": data.offsets and asdict(data.offsets),
         "labels": list(data.labels),
+        "bands": data.bands and list(data.bands),
         "plan_scale": data.plan_scale,
         "margin_db": None if data.margin_db is None else str(data.margin_db),
     }

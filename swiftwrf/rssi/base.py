@@ -23,6 +23,7 @@ from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_near, check_positions
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
+from swiftwrf.rssi.scans import CORRELATION
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
@@ -64,7 +65,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     fitted_attribute = "receiver_names"
     saved: ClassVar[str] = (
         "receiver_position receiver_names origin offsets attenuation detection row_digests quantity unit value_centre "
-        "value_scale"
+        "value_scale scan_correlation"
     )
     """what the file of a predictor contains that is `Saved`, too"""
     receiver_names: Annotated[tuple[str, ...], "r"]
@@ -85,6 +86,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
     """mean of the training values of another quantity than RSSI, which is subtracted before the fit"""
     value_scale: float = 1.0
     """their number in a dB of the fit: other quantities are scaled to the standard deviation of RSSI"""
+    scan_correlation: float = CORRELATION
+    """correlation of the errors of the receivers of a scan"""
     attenuation: Annotated[FloorAttenuation, "r"] | None = None
     """attenuation of the floors between transmitter and receiver, set by `fit` if the data have floors"""
 

@@ -46,5 +46,5 @@ class RssiConfig(FieldConfig):
     """compared variances of one measurement about the field, relative to that of the field. Fading of a packet is about as
     large as shadowing. Means of many packets have less noise"""
     least_noise_with_limits: PositiveFloat = 0.3
-    """smallest of these variances where empty cells are upper limits. With less, weak cells of simulated surveys were
-    predicted 2.6 dB too strong in place of 1.6"""
+    """smallest of these variances where empty cells are upper limits; if all are smaller, their largest. With less, weak
+    cells of simulated surveys were predicted 2.6 dB too strong in place of 1.6"""

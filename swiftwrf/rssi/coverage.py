@@ -1,11 +1,12 @@
-"""Coverage: where a scan has receivers above a threshold with some certainty, and which cells the scans determine.
+"""Coverage: where a scan has receivers beyond a threshold with some certainty, and which cells the scans determine.
 
 A scan is one packet at each of R receivers. Receiver r is above the threshold t with probability
 
     p_r = p(r detects the packet) Phi((mean_r - t) / std_r),
 
 where mean and standard deviation are those of detected packets. The errors of a scan have a common correlation, e.g. by a
-body beside the device (one-factor Gaussian copula).
+body beside the device (one-factor Gaussian copula). Where smaller is better, e.g. for latency, values and threshold change
+their signs.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from pandas import DataFrame
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
-from torch import Tensor
 
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.positions import inside
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.scans import at_least, passing
 
 WIFI_DBM, OTHER_DBM = -67.0, -75.0  # usual thresholds: voice over Wi-Fi; BLE and others
 CERTAINTY = 0.9  # probability from which a cell is covered
 CLASSES = ("not measured", "not covered", "uncertain", "covered")  # of cells, in the order of their numbers
+SMALLER = re.compile(r"latency|delay|jitter|round.?trip|rtt|ping|loss|error|retr|interference|noise", re.IGNORECASE)
 WIFI = re.compile(r"(?<![a-z])(wi-?fi|wlan|wap|ap|b?ssid|access ?point)(?![a-z])", re.IGNORECASE)
 
 
@@ -49,7 +51,7 @@ def default_threshold(data: Rssi) -> tuple[float, str]:
         (-75.0, 'the default for receivers that no name shows to be Wi-Fi')
     """
     if not data.is_power:
-        return float(f"{float(data.rssi_dbm.nanmedian()):.3g}"), "the median of the measured values"
+        return float(f"{np.nanmedian(data.rssi_dbm.numpy()):.3g}"), "the median of the measured values"
     taken = [column for note in data.notes for column in re.findall(r"receiver = (\S+?)(?:,|$)", note)]
     for name in (*data.receiver_names, *taken, data.name):
         if WIFI.search(name):
@@ -57,35 +59,14 @@ def default_threshold(data: Rssi) -> tuple[float, str]:
     return OTHER_DBM, "the default for receivers that no name shows to be Wi-Fi"
 
 
-def at_least(
-    number: int, mean: Tensor, std: Tensor, detection: Tensor, threshold_dbm: float, correlation: float = 0.2
-) -> Tensor:
-    """Return the probability that a scan has at least a number of R receivers above a threshold, float64 (...).
-
-    Args:
-        number: Number of receivers, from 1.
-        mean: Mean of detected packets (R, ...) [dBm].
-        std: Their standard deviation (R, ...) [dB].
-        detection: Probability of a detection (R, ...).
-        threshold_dbm: Threshold.
-        correlation: Correlation of the errors of a scan, by held-out training rows in `benchmarks/rssi.py coverage`.
+def smaller_is_better(quantity: str) -> bool:
+    """Return True for quantities whose names are those of latency, loss, noise and the like.
 
     Example:
-        >>> at_least(1, torch.tensor([-75.0]), torch.tensor([4.0]), torch.tensor([0.8]), -75.0).round(decimals=3)
-        tensor(0.4000, dtype=torch.float64)
+        >>> [smaller_is_better(name) for name in ("latency", "packet loss", "throughput", "signal-to-noise ratio")]
+        [True, True, False, False]
     """
-    z = (mean.double() - threshold_dbm) / std.double().clamp_min(1e-6)
-    score = torch.special.ndtri(detection.double() * torch.special.ndtr(z))
-    total = torch.zeros_like(score[0])
-    nodes, weights = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
-    for node, weight in zip(nodes, weights / weights.sum(), strict=True):
-        given = torch.special.ndtr((score + math.sqrt(correlation) * node) / math.sqrt(1 - correlation))
-        counts = [torch.ones_like(total), *(torch.zeros_like(total) for _ in range(number - 1))]
-        for above in given:  # probabilities of 0 to number - 1 receivers
-            fewer = [torch.zeros_like(above), *counts[:-1]]
-            counts = [count * (1 - above) + less * above for count, less in zip(counts, fewer, strict=True)]
-        total += weight * (1 - torch.stack(counts).sum(dim=0))
-    return total
+    return bool(SMALLER.search(quantity)) and "signal" not in quantity.lower()
 
 
 def reach(model: RssiModel | PairModel, max_open_variance: float = 0.5, max_widening: float = 1.2) -> float:
@@ -124,7 +105,7 @@ def classified(
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Probability that a scan has at least a number of receivers above a threshold, on the cells of one floor.
+    """Probability that a scan has at least a number of receivers beyond a threshold, on the cells of one floor.
 
     Args:
         probability: Probability in each cell of a map, float64 (rows, columns).
@@ -132,8 +113,9 @@ class Coverage:
         measured: Those of them that a scan determines, bool (rows, columns).
         values: Fractions of the measured cells that are `covered` (probability of at least `certainty`), `not_covered` (at
             most 1 - `certainty`) and `uncertain`, of the cells inside that are `not_measured`, and of the `n_scans` scans
-            that are above, `scans_above`; with `threshold_dbm`, `certainty`, `at_least` (number of receivers) and
-            `reach_m`. None is a fraction of nothing, and no limit.
+            that are above, `scans_above`; with `threshold_dbm`, `direction` ("above" or "below", which then holds for
+            `scans_above`, too), `certainty`, `at_least` (number of receivers) and `reach_m`. None is a fraction of
+            nothing, and no limit.
     """
 
     probability: NDArray[np.float64]
@@ -142,7 +124,14 @@ class Coverage:
     values: dict[str, Any]
 
     @classmethod
-    def of(cls, chart: RssiMap, scans: Rssi, limits: tuple[float, float, int], reach: float = math.inf) -> Self:
+    def of(
+        cls,
+        chart: RssiMap,
+        scans: Rssi,
+        limits: tuple[float, float, int],
+        reach: float = math.inf,
+        below: bool = False,
+    ) -> Self:
         """Return the coverage of a map of detected packets, `RssiMap.predict(model, detected=True)`.
 
         Args:
@@ -150,6 +139,7 @@ class Coverage:
             scans: Measured rows on the floor of the map, at its receivers.
             limits: Threshold [dBm], probability from which a cell is covered, above 0.5, and number of receivers.
             reach: Distance from a scan up to which it determines cells, in plan [m].
+            below: True where smaller is better: values below the threshold are covered.
 
         Example:
             >>> import swiftwrf
@@ -160,17 +150,18 @@ class Coverage:
         """
         (threshold_dbm, certainty, number), scans = limits, scans.about(chart.origin)
         mean, std, detection = (torch.from_numpy(field) for field in (chart.mean, chart.std, chart.detection))
-        probability = at_least(number, mean, std, detection, threshold_dbm).numpy()
+        probability = at_least(number, mean, std, detection, threshold_dbm, chart.correlation, below).numpy()
         cells, known = np.stack(np.meshgrid(chart.x, chart.y), axis=-1), scans.transmitter_position[:, :2].numpy()
         enclosed = inside(cells, known) if len(known) else np.zeros(probability.shape, dtype=bool)
         measured = enclosed & (cKDTree(known).query(cells)[0] <= reach)
-        above = ((scans.rssi_dbm > threshold_dbm).sum(dim=1) >= number).numpy()
+        above = passing(scans.rssi_dbm, threshold_dbm, number, below).numpy()
         of_cell = classified(probability, measured, certainty)[measured]
         parts = {name.replace(" ", "_"): of_cell == CLASSES.index(name) for name in CLASSES[:0:-1]}
         # a row at a receiver that moves is no scan
         parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
         fractions = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
-        limited = {"threshold_dbm": threshold_dbm, "certainty": certainty, "at_least": number, "n_scans": len(above)}
+        limited = {"threshold_dbm": threshold_dbm, "direction": "below" if below else "above"}
+        limited |= {"certainty": certainty, "at_least": number, "n_scans": len(above)}
         reach_m = reach if math.isfinite(reach) else None
         return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **fractions})
 
@@ -182,8 +173,9 @@ class Coverage:
 
         Returns:
             `area_m2`, the part `not_covered_m2` of it, and its weakest cell: place `x_m` and `y_m`, the `probability`, the
-            best `receiver`, and the `missing_db` by which that is too weak for its detected packets to be above with the
-            certainty. For at least k receivers it is the k-th best one. 0 dB are missing where packets are lost.
+            best `receiver`, and the `missing_db` by which that is too weak, or too high where smaller is better, for its
+            detected packets to pass with the certainty. For at least k receivers it is the k-th best one. 0 dB are missing
+            where packets are lost.
 
         Example:
             >>> import swiftwrf
@@ -194,7 +186,8 @@ class Coverage:
         """
         threshold_dbm, certainty, number = (self.values[name] for name in ("threshold_dbm", "certainty", "at_least"))
         of_cell = classified(self.probability, self.measured, certainty)
-        shortfall = threshold_dbm + ndtri(certainty) * chart.std.astype(float) - chart.mean
+        sign = -1 if self.values["direction"] == "below" else 1
+        shortfall = sign * (threshold_dbm - chart.mean) + ndtri(certainty) * chart.std.astype(float)
         order = np.argsort(shortfall, axis=0, kind="stable")[number - 1]
         missing = np.take_along_axis(shortfall, order[None], 0)[0]
         areas, n_areas = label((of_cell == 1) | (of_cell == 2), np.ones((3, 3)))

@@ -19,6 +19,7 @@ from swiftwrf.models.prediction import Prediction, difference_unit, suffix
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
 from swiftwrf.positions import to_tensor
 from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.rssi.scans import CORRELATION
 
 CELLS = 120  # of a map, along its longer side
 MAX_CELLS = 2**22
@@ -41,6 +42,7 @@ class RssiMap(Labelled, Displayed):
         origin: Latitude and longitude of x = y = 0, if they are known.
         quantity: RSSI, or what else is predicted.
         unit: Its unit.
+        correlation: Correlation of the errors of the receivers of a scan.
     """
 
     x: Values
@@ -54,6 +56,7 @@ class RssiMap(Labelled, Displayed):
     origin: GeodeticOrigin | None = None
     quantity: str = "RSSI"
     unit: str = "dBm"
+    correlation: float = CORRELATION
 
     @classmethod
     def predict(
@@ -119,7 +122,8 @@ class RssiMap(Labelled, Displayed):
         assert rssi.std is not None
         fields = (rssi.mean, rssi.std, model.predict_detection(grid))
         mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in fields)
-        return cls(x, y, z, cell, mean, std, detection, model.receiver_names, model.origin, model.quantity, model.unit)
+        about = model.receiver_names, model.origin, model.quantity, model.unit, model.scan_correlation
+        return cls(x, y, z, cell, mean, std, detection, *about)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of receivers by their names, or by numbers counted from 1.

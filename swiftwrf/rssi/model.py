@@ -32,6 +32,7 @@ from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import PathLoss, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, predictive_std
+from swiftwrf.rssi.scans import choose_correlation
 from swiftwrf.rssi.training import RssiTraining, prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
@@ -114,6 +115,8 @@ class RssiModel(RssiPredictor, Saved):
         errors = {self.name: predicted[0], "mean": means[rows]}
         self.held_out_db = {name: float((each - train.rssi_dbm).abs().nanmean()) for name, each in errors.items()}
         scale = self._calibrate(train, predicted[-1], std, training.field_db, fit.noise_db)
+        detection = fit.detection[rows]
+        self.scan_correlation = choose_correlation(predicted[-1], scale * std, detection, train.rssi_dbm)
         self.covariance, self.centre = scale.square()[:, None, None] * fit.covariance, training.centre
         self.posterior = RssiPosterior(
             kernel=training.kernel,
@@ -295,6 +298,7 @@ class Fit(NamedTuple):
         std: Standard deviation of a detected measurement about it before calibration, (f, n, R) [dB].
         noise_db: Standard deviation of a measurement about the field, of which the last `std` is, (R,) [dB].
         detection_field: Probability of a detection; None if every cell has a value, or if empty cells are ignored.
+        detection: Probability of a detection at the held-out RSSI, (n, R).
         score: Held-out log-likelihood of values and detections, less a constant.
     """
 
@@ -306,6 +310,7 @@ class Fit(NamedTuple):
     std: Tensor
     noise_db: Tensor
     detection_field: DetectionField | None
+    detection: Tensor
     score: float
 
 
@@ -348,17 +353,18 @@ def fit_receivers(
         for fold, noise in zip(training.folds, noise_db, strict=True)
     ]
     std = torch.stack(stds)
-    detection_field, power, score = None, level, 0.0
+    detection_field, power, score, detection = None, level, 0.0, torch.ones_like(level[0])
     if loss.detection is not None:
         power, std = loss.detection.given_detection(level, std)
         if not bool(measured.all()):
             bins = training.position, measured, training.fold, level[0]
             detection_field, likelihood = DetectionField.fit(training.kernel, *bins, loss.detection.limit)
             score = float(likelihood.sum())
+            detection = detection_field.probability(level[-1], training.position)
     predicted = power - training.shift
     error = (predicted[0] - training.rssi)[measured].abs()
     score -= len(error) * math.log(max(float(error.mean()), 1e-3))
-    return Fit(training, fitted, covariance, distance, predicted, std, noise_db[-1], detection_field, score)
+    return Fit(training, fitted, covariance, distance, predicted, std, noise_db[-1], detection_field, detection, score)
 
 
 def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:

@@ -142,7 +142,8 @@ def prepare(
         limits.append(torch.full_like(limits[0], torch.nan))
     residual = torch.stack([of_pool.rssi - each.each(distance) for each in losses], dim=-1)[:, often_detected(pool)]
     # values above a limit vary less than all, so that too little noise would seem best
-    least = [config.least_noise_with_limits if bool(limit.isfinite().any()) else 0.0 for limit in limits]
+    with_limits = min(config.least_noise_with_limits, max(config.noises))
+    least = [with_limits if bool(limit.isfinite().any()) else 0.0 for limit in limits]
     kernels = choose_residual_kernels(bins, residual, config.noises, pool.floors is not None, least)
     heads, results = Heads.alike(config.n_primitives, config.seed), []
     for each, limit, (kernel, has_field) in zip(losses, limits, kernels, strict=True):

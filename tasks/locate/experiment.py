@@ -38,14 +38,16 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     if isinstance(data, Stations):
         config.check_stations()
     else:
+        data.check_power("a locator")
         how = None if config.data is None else reading(config, config.data)
         rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
+    source = data.source | (rooms.source if rooms else {})
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run("locate", label, config, device, data.source, resume, described=_described) as directory,
+        Run("locate", label, config, device, source, resume, described=_described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             common: Row = {"split": config.split, "seed": config.seed, "keep": directory, "executor": workers}

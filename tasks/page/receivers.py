@@ -22,7 +22,9 @@ BAND = 0.35  # width of the part of the figure beside the rows, relative to thei
 
 
 def with_receivers(recorded: Recorded, data: Rssi) -> Recorded:
-    """Return a recorded result with the positions of the receivers of unknown position, estimated from its rows."""
+    """Return a recorded result with the positions of the receivers of unknown position, estimated from its RSSI."""
+    if not data.is_power:
+        return recorded
     often = data.detected.sum(dim=0).where(~data.receiver_located, 0).argsort(descending=True, stable=True)
     kept = data.receiver_located.clone()
     kept[often[:MAX_ESTIMATED]] = True

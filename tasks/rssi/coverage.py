@@ -37,9 +37,22 @@ def why(run: Records) -> str:
     if run.metrics["threshold"] is None:
         return ""
     threshold, unit = run.metrics["coverage"][0]["threshold_dbm"], Maps(run).unit
+    options = "--above" if unit == "dBm" else "--above or --below"
     return (
-        f"The threshold of {threshold:g} {unit} is {run.metrics['threshold']}; `--above {unit.upper()}` sets another."
+        f"The threshold of {threshold:g} {unit} is {run.metrics['threshold']}; `{options} {unit.upper()}` sets another."
     )
+
+
+def bands_sentence(run: Records) -> str:
+    """Return the coverage of each band at the first threshold; empty without bands."""
+    found, several = run.metrics.get("bands", []), len(run.metrics["coverage"]) > 1
+    first = run.metrics["coverage"][0]["threshold_dbm"]
+    shares = [
+        f"{row['covered']:.0%} by {row['band']}" + (f" on {row['floor']}" if several else "")
+        for row in found
+        if row["threshold_dbm"] == first and row["covered"] is not None
+    ]
+    return f"The measured area is covered to {', '.join(shares)}." if shares else ""
 
 
 def held_out_sentence(run: Records) -> str:
@@ -66,38 +79,36 @@ def spots_sentence(floors: Sequence[Maps]) -> str:
                 (
                     spot["not_covered_m2"],
                     spot["area_m2"],
-                    f"{place} ({missing(spot, maps.error_unit)} at {spot['receiver']})",
+                    f"{place} ({missing(spot, maps)} at {spot['receiver']})",
                 )
             )
     largest = [text for *_, text in sorted(named, key=lambda one: one[:2], reverse=True)[:MAX_NAMED]]
     return f"Largest weak spots: {'; '.join(largest)}." if largest else ""
 
 
-def missing(spot: Row, unit: str = "dB") -> str:
-    """Return what a weak spot lacks, in words.
-
-    Example:
-        >>> missing({"missing_db": 4.2}), missing({"missing_db": 0.0})
-        ('4 dB missing', 'packets are lost')
-    """
-    db = spot["missing_db"]
-    return f"{db:.0f} {unit} missing" if db >= MIN_MISSING_DB else "packets are lost"
+def missing(spot: Row, maps: Maps) -> str:
+    """Return what a weak spot of a floor lacks, in words."""
+    if maps.unit == "dBm" and spot["missing_db"] < MIN_MISSING_DB:
+        return "packets are lost"
+    return f"{maps.amount(spot['missing_db'])} {'too high' if maps.is_below else 'missing'}"
 
 
 def section(run: Records) -> Section:
     """Return weak spots, and coverage by threshold and receiver."""
     floors = Maps.of_floors(run)
     tables = [_spots(floors)] if any(maps.spots for maps in floors) else []
-    every, several, unit = run.table("coverage"), len(floors) > 1, floors[0].unit
+    every, several, limit = run.table("coverage"), len(floors) > 1, f"{floors[0].direction} [{floors[0].unit}]"
     of_one = ~every["receiver"].isin([ANY, TWO])
     if run.metrics["rooms"]:
-        tables.append(_rooms(run.table("rooms")))
+        tables.append(_rooms(run.table("rooms"), limit))
+    if run.metrics.get("bands"):
+        tables.append(_table(run.table("bands"), several, limit, by="band"))
     found = Section("", [*filter(None, [why(run)])], tables)
     if of_one.all():
-        found.tables.append(_table(every, several, unit))
+        found.tables.append(_table(every, several, limit))
     else:
-        found.tables.append(_table(every[~of_one], several, unit))
-        found.parts.append(Section("Each receiver", tables=[_table(every[of_one], several, unit)], folded=True))
+        found.tables.append(_table(every[~of_one], several, limit))
+        found.parts.append(Section("Each receiver", tables=[_table(every[of_one], several, limit)], folded=True))
     return found
 
 
@@ -113,34 +124,34 @@ def _spots(floors: Sequence[Maps]) -> Table:
                     *floor,
                     *sizes,
                     f"{spot['probability']:.0%}",
-                    missing(spot, maps.error_unit),
+                    missing(spot, maps),
                     spot["receiver"],
                 ]
             )
     heads = ["x [m]", "y [m]", "area [m²]", "not covered [m²]", "probability", "missing", "best receiver"]
-    found, unit = floors[0].coverage, floors[0].unit
+    found, first = floors[0].coverage, floors[0]
     caption = (
-        f"Weak spots: connected parts of the measured area that are not covered above {found['threshold_dbm']:g} {unit}. "
-        f"The place is the weakest one. Missing there: {floors[0].error_unit} by which the best receiver is too weak for "
-        f"{found['certainty']:.0%} of its detected packets. All are in `weak_spots.csv`."
+        f"Weak spots: connected parts of the measured area that are not covered {first.limit}. The place is the weakest "
+        f"one. Missing there: {first.error_unit} by which the best receiver is too {'high' if first.is_below else 'weak'} "
+        f"for {found['certainty']:.0%} of its {first.measurement}s. All are in `weak_spots.csv`."
     )
     return Table(["", *(["floor"] if floors[0].suffix else []), *heads], rows, caption)
 
 
-def _table(table: DataFrame, several: bool, unit: str) -> Table:
+def _table(table: DataFrame, several: bool, limit: str, by: str = "receiver") -> Table:
     columns = {
         "covered": "covered",
         "not_covered": "not covered",
         "uncertain": "uncertain",
         "not_measured": "not measured",
-        "scans_above": "scans above",
+        "scans_above": f"scans {limit.partition(' ')[0]}",
         "test_predicted": "test scans, predicted",
         "test_above": "test scans, counted",
     }
     columns = {name: head for name, head in columns.items() if name in table}
     rows = [
         [
-            row["receiver"],
+            row[by],
             *([str(row["floor"])] if several else []),
             f"{row['threshold_dbm']:g}",
             *("-" if row[name] != row[name] or row[name] is None else f"{row[name]:.0%}" for name in columns),
@@ -148,15 +159,17 @@ def _table(table: DataFrame, several: bool, unit: str) -> Table:
         for row in table.to_dict("records")
     ]
     caption = (
-        f"Coverage by receiver. {ANY.capitalize()}: a scan has at least one above the threshold. {TWO.capitalize()}: the "
-        "second-best receiver is above it, too, as roaming needs. Not measured: part of the area between the scans. Test "
+        f"Coverage by receiver. {ANY.capitalize()}: a scan has at least one beyond the threshold. {TWO.capitalize()}: the "
+        "second-best receiver is beyond it, too, as roaming needs. Not measured: part of the area between the scans. Test "
         "scans took no part in the fit. `coverage.csv` contains the same."
     )
-    heads = ["receiver", *(["floor"] if several else []), f"above [{unit}]", *columns.values()]
+    if by == "band":
+        caption = "Coverage by band: a scan has at least one receiver of the band beyond the threshold. `bands.csv`."
+    heads = [by, *(["floor"] if several else []), limit, *columns.values()]
     return Table(heads, rows, caption)
 
 
-def _rooms(table: DataFrame) -> Table:
+def _rooms(table: DataFrame, limit: str) -> Table:
     names = ("area_m2", "covered", "not_covered", "uncertain", "not_measured")
     rows = [
         [
@@ -168,5 +181,5 @@ def _rooms(table: DataFrame) -> Table:
         ]
         for row in table.to_dict("records")
     ]
-    heads = ["room", "above [dBm]", "area [m²]", "covered", "not covered", "uncertain", "not measured", "best receiver"]
+    heads = ["room", limit, "area [m²]", "covered", "not covered", "uncertain", "not measured", "best receiver"]
     return Table(heads, rows, "Coverage of each room by any receiver; percentages of its measured area. `rooms.csv`.")

@@ -42,10 +42,11 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    for reason in compared(data, config.also)[1].values():
+    for reason in compared(data, config.also)[1].values() if data.is_power else ():  # others have no models of power
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
     source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
+    source |= rooms.source if rooms else {}
 
     def described(value: Row) -> str:
         return f"{value['median']:.2f} {difference_unit(whole.unit)}" if "median" in value else ""
@@ -66,7 +67,9 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 validation=config.validation,
                 reference=how.reference if how else None,
                 fewer=FEWER,
+                repeats=config.repeats,
                 above=config.above,
+                below=config.below,
                 rooms=rooms,
                 device=device,
                 keep=directory,
@@ -80,16 +83,16 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
         if plan is not None:
             plan.save(directory.folder)
         recorded = with_receivers(result.recorded(), result.train)
-        _suggest(result, config, directory, float(recorded.metrics["coverage"][0]["threshold_dbm"]))
+        _suggest(result, config, directory)
         finish(directory, recorded, page, offset_notes(data))
 
 
-def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run, above_dbm: float) -> None:
+def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run) -> None:
     """Write the positions to measure next, and print the first ones, or that none is worth it."""
     model, train = result.predictors[result.model], result.train
     if not config.suggest or not isinstance(model, RssiModel):
         return
-    found = suggest_scans(model, train, config.suggest, above_dbm)
+    found = suggest_scans(model, train, config.suggest, result.thresholds[0][0], result.is_below)
     if not is_worth(found.variance.numpy()):
         console.print(NOT_WORTH)
         return

@@ -22,7 +22,7 @@ from swiftwrf.rssi.coverage import CLASSES, classified
 from tasks.labels import COVERAGE
 from tasks.page import figures, maps
 from tasks.page.page import Plot
-from tasks.records import Records, Row
+from tasks.records import Records, Row, file_columns
 
 MAX_MAPS = 30  # of receivers, in a report of several floors; all are in the tables, and on the page of swiftwrf view
 FIRST_MAPS = 6  # of the receivers of a floor that are not folded
@@ -97,6 +97,26 @@ class Maps:
         return str(self.run.metrics.get("unit", "dBm"))
 
     @property
+    def direction(self) -> str:
+        """Side of the threshold that is covered: "above", or "below" where smaller is better."""
+        return str(self.coverage.get("direction", "above"))
+
+    @property
+    def is_below(self) -> bool:
+        """True where smaller is better."""
+        return self.direction == "below"
+
+    @property
+    def limit(self) -> str:
+        """First threshold with its direction, in sentences."""
+        return f"{self.direction} {self.coverage['threshold_dbm']:g} {self.unit}"
+
+    @property
+    def measurement(self) -> str:
+        """Name of the values that the coverage counts."""
+        return "detected packet" if self.unit == "dBm" else "measurement"
+
+    @property
     def error_unit(self) -> str:
         """Unit of differences of the values."""
         return difference_unit(self.unit)
@@ -112,8 +132,9 @@ class Maps:
 
     @cached_property
     def best(self) -> dict[str, NDArray[Any]]:
-        """Prediction [dBm], width of its interval [dB] and detection at the receiver of the highest one in each cell."""
-        server = self.arrays["predicted"].argmax(axis=0)[None]
+        """Prediction [dBm], width of its interval [dB] and detection at the best receiver in each cell."""
+        predicted = self.arrays["predicted"]
+        server = (predicted.argmin(axis=0) if self.is_below else predicted.argmax(axis=0))[None]
         kinds = ("predicted", "width", "detection")
         return {kind: np.take_along_axis(self.arrays[kind], server, 0)[0] for kind in kinds}
 
@@ -122,6 +143,8 @@ class Maps:
         """Legend of the hatches."""
         reach = self.coverage["reach_m"]
         far = "" if reach is None else f" or more than {reach:.1f} m from any scan"
+        if self.unit != "dBm":
+            return f"Hatched: not measured, outside the scans{far}."
         return f"Hatched like /: not measured, outside the scans{far}; like \\: a packet is more likely lost than received."
 
     @property
@@ -181,7 +204,7 @@ class Maps:
         who = f"one of {len(first.names)} receivers" if several else first.names[0]
         far = "" if found["reach_m"] is None else f", or farther than {found['reach_m']:.1f} m from any"
         caption = (
-            f"Coverage: a packet at {who} is above {found['threshold_dbm']:g} {first.unit} with a probability of at least "
+            f"Coverage: a {first.measurement.split()[-1]} at {who} is {first.limit} with a probability of at least "
             f"{found['certainty']:.0%} (covered), of at most {1 - found['certainty']:.0%} (not covered), or between them "
             f"(uncertain). Percentages are of the measured area. Grey: not between the scans (dots){far}. Numbers: weak "
             "spots of the table. Crosses: receivers."
@@ -207,7 +230,8 @@ class Maps:
         same = f"; the {widths} is about {self.amount(self.widest[3])} in the whole measured area"
         widths = f", and the {widths}" if self.varies else same
         caption = f"Predicted {self.quantity}{widths}. {self.hatched}" + (
-            " The best server is the receiver with the highest prediction; crosses mark receivers."
+            f" The best server is the receiver with the {'lowest' if self.is_below else 'highest'} prediction; crosses mark "
+            "receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
             "marks the receiver."
@@ -223,7 +247,7 @@ class Maps:
         """
         a = self.arrays
         strength = a["predicted"][:, a["known"] if a["known"].any() else ...].reshape(len(self.names), -1).mean(axis=1)
-        strongest = np.argsort(-strength, kind="stable").tolist()
+        strongest = np.argsort(strength if self.is_below else -strength, kind="stable").tolist()
         most = max(FIRST_MAPS, MAX_MAPS // len(a["floor_names"]))
         shown = strongest[:FIRST_MAPS] if first else strongest[FIRST_MAPS:most]
         if not shown:
@@ -233,7 +257,8 @@ class Maps:
         values = [{name: a[name][i] for name in fields} for i in shown]
         panels = [self._panel(each, kind, self.names[i], i, 3.6) for each, i in zip(values, shown, strict=True)]
         what = f"Predicted {self.quantity}" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
-        which = f"the {len(shown)} strongest of {len(self.names)} receivers" if first else "the next ones"
+        best = "strongest" if self.unit == "dBm" else "best"
+        which = f"the {len(shown)} {best} of {len(self.names)} receivers" if first else "the next ones"
         caption = f"{what} at {which}. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
         name = ("map" if kind == "predicted" else "width") + ("" if first else "-more")
         return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
@@ -320,4 +345,4 @@ class Maps:
         named = {"predicted": "predicted_dbm", "width": "width_db", "detection": "detection", "above": "above"}
         columns |= {named[name]: values.ravel().round(2) for name, values in fields.items()}
         columns["measured"] = np.tile(a["known"].ravel(), len(receivers))
-        return DataFrame(columns)
+        return DataFrame(columns).rename(columns=file_columns(self.run.metrics))

@@ -13,7 +13,7 @@ from swiftwrf.contrib.comparison.errors import paired_difference
 from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT
 from swiftwrf.data.splits import places
 from swiftwrf.metrics import LEVEL
-from swiftwrf.models.prediction import difference_unit
+from swiftwrf.models.prediction import difference_unit, suffix
 from tasks.labels import PREDICTORS, colour, meanings
 from tasks.page import figures
 from tasks.page.page import Number, Page, Plot, Section, Summary, number, provenance, sections_of
@@ -83,12 +83,9 @@ def _summary(run: Records, found: Answer) -> Summary:
     floors, interval = Maps.of_floors(run), run.metrics["interval"]
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
-    threshold, unit = floors[0].coverage["threshold_dbm"], floors[0].error_unit
+    unit = floors[0].error_unit
     numbers = [
-        *(
-            Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} above {threshold:g} {maps.unit}")
-            for maps in floors
-        ),
+        *(Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} {maps.limit}") for maps in floors),
         Number(f"{error[found.chosen]['median']:.2f} {unit}", f"median absolute error of {found.chosen}"),
         Number(f"{error[best]['median']:.2f} {unit}", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
@@ -101,7 +98,7 @@ def _suggestion(run: Records) -> Section | None:
     return maps_suggestion(
         run,
         "The mean over the walked area is weighted by p (1 - p), where p is the probability that a scan has a receiver "
-        "above the threshold of the coverage.",
+        "beyond the threshold of the coverage.",
     )
 
 
@@ -121,17 +118,17 @@ def _maps(run: Records, kind: str) -> Section:
 def _errors(run: Records, found: Answer) -> Section:
     caption = (
         f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test places. Detection: mean of the fractions of detected and of empty test cells that are predicted "
-        "as such; 0.5 is chance."
+        "interval over test places. Over splits: mean and standard deviation of the median error. Detection: mean of the "
+        "fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
     )
     section = errors_section(
         found,
-        run.table("errors")[COLUMNS],
+        run.in_files(run.table("errors")[COLUMNS]),
         COLOURS,
         name=run.file_name,
         quantity="absolute error",
         caption=caption,
-        paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values()],
+        paragraphs=[f"Left out: {reason}." for reason in run.metrics["left_out"].values() if Maps(run).unit == "dBm"],
         panels=_by_rows(run),
     )
     section.tables.append(where_methods_differ(run, found))
@@ -148,6 +145,8 @@ def answer(run: Records) -> Answer:
     for name, entry in run.metrics["overall"].items():
         detection = entry.get("detection")
         cells = {f"{own} minus it [{unit}]": difference(errors, own, name)}
+        if (over := run.metrics.get("repeats", {}).get(name)) is not None:
+            cells[f"over {over['n']:.0f} splits [{unit}]"] = f"{over['median_mean']:.2f} ± {over['median_std']:.2f}"
         cells |= {"detection": number(None if detection is None else sum(detection) / 2)} if scored else {}
         seconds = entry["seconds"]["fit"], entry["seconds"]["predict"]
         methods.append(Method(name, entry["abs_error_db"], name in REFERENCES and name != chosen, seconds, cells))
@@ -191,15 +190,28 @@ def conclusion(run: Records) -> list[str]:
     compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="pairs")
     return [
         *recommendation(run, own, unit)[1],
-        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} above {first['threshold_dbm']:g} "
-        f"{floors[0].unit} with {first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} {unit} "
+        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} {floors[0].limit} "
+        f"with {first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} {unit} "
         "(median error).",
         *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
-        *filter(None, [coverage.spots_sentence(floors), coverage.held_out_sentence(run), coverage.why(run)]),
+        *filter(None, [coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
+        *filter(None, [coverage.held_out_sentence(run), coverage.why(run)]),
         *receivers_sentence(run),
+        *repeats_sentence(run),
         sure,
         compared,
     ]
+
+
+def repeats_sentence(run: Records) -> list[str]:
+    """Return mean and standard deviation over splits of the median errors of the model and the best baseline."""
+    found, names, unit = run.metrics.get("repeats", {}), (model_of(run), best_baseline(run)), Maps(run).error_unit
+    over = [
+        f"{name} {found[name]['median_mean']:.2f} {unit} (standard deviation {found[name]['median_std']:.2f})"
+        for name in names
+        if name in found
+    ]
+    return [f"Median errors over {found[names[0]]['n']:.0f} splits: {', '.join(over)}."] if over else []
 
 
 def steps(run: Records) -> list[NextStep]:
@@ -291,7 +303,7 @@ def _differences(run: Records) -> list[Plot]:
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
         f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
     )
-    data = figures.dots_data("receiver", names, values, "db")
+    data = figures.dots_data("receiver", names, values, suffix(Maps(run).error_unit))
     return [Plot(f"difference-{run.file_name}", [figure], caption, data)]
 
 
@@ -324,5 +336,5 @@ def _where(run: Records) -> Plot:
         f"Predicted against measured {Maps(run).quantity}, and the absolute error (dots; line: running median) against "
         "the distance from the receiver, if its position is known, and from the nearest training position. All receivers."
     )
-    data = own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]]
+    data = run.in_files(own[["receiver", "index", "measured_dbm", "predicted_dbm", "abs_error_db", *columns]])
     return Plot(f"where-{run.file_name}", panels, caption, data)

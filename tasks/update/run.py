@@ -17,6 +17,7 @@ from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS, SNAPSHOT_FORMATS, SPECTRA_FORMATS
 from swiftwrf.errors import one_line, with_article
 from swiftwrf.models.base import ALREADY_LEARNT
+from swiftwrf.models.prediction import difference_unit
 from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
@@ -162,7 +163,7 @@ def _write_config(config: UpdateConfig, folder: Path) -> None:
 
 
 def _unit(model: FieldModel | RssiModel) -> str:
-    return "dB" if isinstance(model, RssiModel) else ""
+    return difference_unit(model.unit) if isinstance(model, RssiModel) else ""
 
 
 def _model(path: str) -> FieldModel | RssiModel:

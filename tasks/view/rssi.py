@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,13 +15,14 @@ from numpy.typing import NDArray
 
 from swiftwrf import Prediction, Rssi, RssiModel
 from swiftwrf.data.coordinates import Floors
-from swiftwrf.errors import InputError
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.locate.posterior import PlanMap
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import CLASSES, OTHER_DBM, Coverage, classified, default_threshold, reach
+from swiftwrf.models.prediction import difference_unit, suffix
+from swiftwrf.rssi.coverage import CLASSES, OTHER_DBM, Coverage, classified, default_threshold, reach, smaller_is_better
 from swiftwrf.rssi.maps import RssiMap
 from tasks.page.maps import CLASS_COLOURS, Corners, FloorPlan
-from tasks.records import METRICS, RECEIVERS, as_table, read_json, read_npz, rounded
+from tasks.records import METRICS, RECEIVERS, Row, as_table, read_json, read_npz, rounded
 from tasks.rssi.coverage import coverage_sentence
 from tasks.rssi.maps import MAX_WIDTH_DB
 from tasks.view.locating import RssiLocating
@@ -36,22 +38,31 @@ def rows_of_run(file: Path, model: RssiModel) -> Rssi:
     """Return the measured rows in the `maps.npz` of a run of a model.
 
     Raises:
-        InputError: The file is damaged, contains other receivers, or is of another quantity than RSSI.
+        InputError: The file is damaged, or contains other receivers.
     """
-    if model.quantity != "RSSI":
-        raise InputError(
-            f"{file.parent} is a run of {model.quantity}; the page shows RSSI, the report of the run its maps"
-        )
     stored = read_npz(file)
     measured, position, receiver = stored["measured"], stored["measured_position"], stored["receiver"]
-    return Rssi(measured, position, receiver_position=receiver, receiver_names=model.receiver_names)
+    return _rows(model, measured, position, receiver, stored["bands"].tolist() if "bands" in stored else [])
 
 
 def rows_of_model(model: RssiModel) -> Rssi:
     """Return rows at the positions that a model contains, without the RSSI measured there."""
-    position, names = model.region(), model.receiver_names
-    empty = torch.full((len(position), len(names)), torch.nan)
-    return Rssi(empty, position, receiver_position=model.receiver_position, receiver_names=names)
+    position = model.region()
+    return _rows(
+        model, torch.full((len(position), len(model.receiver_names)), torch.nan), position, model.receiver_position
+    )
+
+
+def _rows(model: RssiModel, measured: Numbers, position: Numbers, receiver: Numbers, bands: Sequence[str] = ()) -> Rssi:
+    return Rssi(
+        measured,
+        position,
+        receiver_position=receiver,
+        receiver_names=model.receiver_names,
+        bands=bands or None,
+        quantity=model.quantity,
+        unit=model.unit,
+    )
 
 
 @dataclass(frozen=True)
@@ -61,10 +72,11 @@ class MapSelection:
     kind: MapKind  # what the map shows
     receiver: int  # number of the receiver, counted from 0. Maps of all receivers ignore it
     height: float  # height of the transmitter [m]
-    threshold: float = OTHER_DBM  # threshold of the coverage [dBm]
-    certainty: float = 0.9  # required probability that a measurement exceeds the threshold, in (0, 1)
+    threshold: float = OTHER_DBM  # threshold of the coverage, in the unit of the values
+    certainty: float = 0.9  # required probability that a measurement passes the threshold, in (0, 1)
     row: int = 0  # row whose posterior is shown, counted from 0
     at_least: int = 0  # number of receivers of the coverage; 0 for that of the selected receiver
+    band: str = ""  # band of the receivers of the coverage, empty for all
 
 
 @dataclass(frozen=True)
@@ -124,10 +136,45 @@ class RssiView:
 
     @property
     def threshold(self) -> float:
-        """Threshold of the coverage that is shown first [dBm]: that of the run, or else the default."""
-        if self.folder is not None and (found := read_json(self.folder / METRICS).get("coverage")):
-            return float(found[0]["threshold_dbm"])
-        return default_threshold(self.rows)[0]
+        """Threshold of the coverage that is shown first: that of the run, or else the default."""
+        if self._coverage:
+            return float(self._coverage["threshold_dbm"])
+        if self.rows.is_power or self.rows.detected.any():
+            return default_threshold(self.rows)[0]
+        return float(f"{float(self.model.value_centre):.3g}")  # a saved model does not contain what was measured
+
+    @cached_property
+    def _coverage(self) -> Row:
+        """Coverage of the lowest floor of the run, empty without a run."""
+        found = read_json(self.folder / METRICS).get("coverage") if self.folder is not None else None
+        return dict(found[0]) if found else {}
+
+    @property
+    def below(self) -> bool:
+        """True if values below the threshold are covered."""
+        default = "below" if smaller_is_better(self.model.quantity) else "above"
+        return str(self._coverage.get("direction", default)) == "below"
+
+    @property
+    def direction(self) -> str:
+        """Side of the threshold that is covered."""
+        return "below" if self.below else "above"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return self.model.unit
+
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """Lowest and highest threshold that can be chosen, and the step between them."""
+        if self.unit == "dBm":
+            return -110.0, -30.0, 1.0
+        values = self.rows.rssi_dbm[self.rows.detected].numpy()
+        values = np.append(values if len(values) else self.map(self.heights[1]).mean, self.threshold)
+        low, high = float(values.min()), float(values.max())
+        step = 10.0 ** np.floor(np.log10(max(high - low, 1e-9) / 50))
+        return float(np.floor(low / step) * step), float(np.ceil(high / step) * step), float(step)
 
     @property
     def position(self) -> Values:
@@ -200,23 +247,26 @@ class RssiView:
                 shown = self.rows.rssi_dbm[detected].numpy() if detected.any() else mean
                 low, high = np.percentile(shown, (1, 99)).tolist()
                 dots = "; dots: measured, in the same colours, hollow where nothing was received"
-                text = f"Predicted RSSI of {name}{dots if detected[:, receiver].any() else ''}.{hatched}"
-                return ColouredMap(text, mean[receiver], "viridis", low, high, "dBm", "both")
+                shown_dots = dots if detected[:, receiver].any() else ""
+                text = f"Predicted {self.model.quantity} of {name}{shown_dots}.{hatched}"
+                return ColouredMap(text, mean[receiver], "viridis", low, high, self.unit, "both")
             case "interval":
                 low, high = chart.prediction.interval(LEVEL)
                 text = f"Width of the {LEVEL:.0%} interval of a measurement at {name}.{hatched}"
-                return ColouredMap(text, (high - low)[receiver].numpy(), "magma", 0.0, MAX_WIDTH_DB, "dB", "max")
+                width = (high - low)[receiver].numpy()
+                widest = MAX_WIDTH_DB if self.unit == "dBm" else float(np.percentile(width, 99))
+                return ColouredMap(text, width, "magma", 0.0, widest, difference_unit(self.unit), "max")
             case "coverage":
                 text = (
-                    f"Coloured: {self._who(selection)} above {selection.threshold:g} dBm with {selection.certainty:.0%} "
-                    f"certainty. {coverage_sentence(self.coverage(selection, counted=True).values)}"
+                    f"Coloured: {self._passing(selection)} with {selection.certainty:.0%} certainty. "
+                    f"{coverage_sentence(self.coverage(selection, counted=True).values)}"
                 )
                 return ColouredMap(text, self.classes(selection).astype(float), CLASS_COLOURS, 0, len(CLASSES) - 1, "")
             case "best receiver":
                 first, part = next(iter(self.best(selection.height).items()))
                 best = f"{self.receivers[first]} on {part:.0%} of the measured area"
-                text = f"Receiver with the highest prediction: {best}.{hatched}"
-                values = mean.argmax(axis=0) % N_RECEIVER_COLOURS + 0.5
+                text = f"Receiver with the {'lowest' if self.below else 'highest'} prediction: {best}.{hatched}"
+                values = self._best(mean) % N_RECEIVER_COLOURS + 0.5
                 return ColouredMap(text, values, RECEIVER_COLOURS, 0, N_RECEIVER_COLOURS, "")
         raise AssertionError(selection.kind)
 
@@ -232,16 +282,30 @@ class RssiView:
 
     def _who(self, selection: MapSelection) -> str:
         """Return the receivers of the selected coverage, in words."""
+        if selection.band:
+            return f"one of {len(self.rows.receivers_by_band[selection.band])} receivers of {selection.band}"
         names = {0: self.receivers[selection.receiver], 1: f"one of {len(self.receivers)} receivers"}
         return names.get(selection.at_least, f"at least {selection.at_least} receivers")
+
+    def _passing(self, selection: MapSelection) -> str:
+        """Return the receivers and the threshold of the selected coverage, in words."""
+        return f"{self._who(selection)} {self.direction} {selection.threshold:g} {self.unit}"
+
+    def _best(self, mean: Values) -> NDArray[np.int64]:
+        """Return the number of the best of the receivers (R, ...)."""
+        return np.asarray(mean.argmin(axis=0) if self.below else mean.argmax(axis=0))
 
     def coverage(self, selection: MapSelection, counted: bool = False, chart: RssiMap | None = None) -> Coverage:
         """Return the selected coverage, in the cells of a map of detected packets if one is given; see `map`."""
         chart = chart or self.map(selection.height, counted, detected=True)
         scans, number = self.rows.subset(self.on_floor(selection.height)), selection.at_least
-        if number == 0:
+        if selection.band:
+            columns, number = self.rows.receivers_by_band[selection.band], 1
+            chart, scans = chart.receivers([self.receivers[column] for column in columns]), scans.columns(columns)
+        elif number == 0:
             chart, scans = chart.receivers([self.receivers[selection.receiver]]), scans.columns([selection.receiver])
-        return Coverage.of(chart, scans, (selection.threshold, selection.certainty, max(number, 1)), reach(self.model))
+        limits = selection.threshold, selection.certainty, max(number, 1)
+        return Coverage.of(chart, scans, limits, reach(self.model), self.below)
 
     def classes(self, selection: MapSelection) -> NDArray[np.int64]:
         """Return the numbers in `CLASSES` of the cells of the map that is shown, (rows, columns)."""
@@ -249,11 +313,11 @@ class RssiView:
         return classified(found.probability, found.measured, selection.certainty)
 
     def best(self, height: float) -> dict[int, float]:
-        """Return the fraction of the measured cells where each receiver has the highest prediction, the largest first.
+        """Return the fraction of the measured cells where each receiver is the best one, the largest first.
 
         All cells count on a floor without scans.
         """
-        best, known = self.map(height, counted=True).mean.argmax(axis=0), self.known(height, counted=True)
+        best, known = self._best(self.map(height, counted=True).mean), self.known(height, counted=True)
         counts = np.bincount(best[known if known.any() else ...].ravel())
         order = [int(number) for number in np.argsort(-counts, kind="stable") if counts[number]]
         return {number: float(counts[number] / counts.sum()) for number in order}
@@ -274,17 +338,19 @@ class RssiView:
                 what = f"expected position error {value:.2f} m" if is_error else f"posterior {value:.1%} of its maximum"
             return f"at {x:.2f}, {y:.2f} m\n{what}"
         rssi, r = self.at(selection, x, y), selection.receiver
-        mean, (low, high) = rssi.mean, rssi.interval(LEVEL)
+        mean, (low, high), unit = rssi.mean, rssi.interval(LEVEL), self.unit
         lines = [
             f"at {x:.2f}, {y:.2f} m",
-            f"{self.receivers[r]}: {mean[r]:.1f} dBm, {LEVEL:.0%} of measurements in [{low[r]:.1f}, {high[r]:.1f}] dBm",
+            f"{self.receivers[r]}: {mean[r]:.1f} {unit}, {LEVEL:.0%} of measurements in "
+            f"[{low[r]:.1f}, {high[r]:.1f}] {unit}",
         ]
         if selection.kind == "coverage":
             here = RssiMap.predict(self.model, 1.0, selection.height, np.array([[x, y]]), detected=True)
             above = float(self.coverage(selection, chart=here).probability[0, 0])
-            lines.append(f"{self._who(selection)} above {selection.threshold:g} dBm with {above:.0%}")
+            lines.append(f"{self._passing(selection)} with {above:.0%}")
         if len(self.receivers) > 1:
-            lines.append(f"best receiver: {self.receivers[int(mean.argmax())]}, {mean.max():.1f} dBm")
+            best = int(self._best(mean.numpy()))
+            lines.append(f"best receiver: {self.receivers[best]}, {mean[best]:.1f} {unit}")
         return "\n".join(lines)
 
     def table(self, selection: MapSelection) -> str:
@@ -297,9 +363,10 @@ class RssiView:
             return as_table(rounded(table.to_dict("records")))
         chart, r = self.map(selection.height), selection.receiver
         low, high = (end[r].double().numpy().ravel() for end in chart.prediction.interval(LEVEL))
-        table = chart.receivers([self.receivers[r]]).to_frame().drop(columns="std_db")
-        table = table.assign(low_dbm=low, high_dbm=high)
-        name = f"above_{selection.threshold:g}_dbm_with_{selection.certainty:.0%}"
+        unit, differences = suffix(self.unit), suffix(difference_unit(self.unit))
+        table = chart.receivers([self.receivers[r]]).to_frame().drop(columns=f"std_{differences}")
+        table = table.assign(**{f"low_{unit}": low, f"high_{unit}": high})
+        name = f"{self.direction}_{selection.threshold:g}_{unit}_with_{selection.certainty:.0%}"
         table[name] = np.array(CLASSES)[self.classes(selection).ravel()]
-        table["best_receiver"] = np.array(self.receivers)[chart.mean.argmax(axis=0).ravel()]
+        table["best_receiver"] = np.array(self.receivers)[self._best(chart.mean).ravel()]
         return as_table(rounded(table.to_dict("records")))

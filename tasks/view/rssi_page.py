@@ -59,7 +59,7 @@ class RssiPage:
         self._placing: dict[str, ui.number] = {}
         self._maps, self._points = NewestOnly(self._show_map), NewestOnly(self._show_point)
         with header(view.title, view.notes):
-            kinds = {kind: KIND_LABELS.get(kind, kind) for kind in view.kinds}
+            kinds = {kind: {**KIND_LABELS, "RSSI": view.model.quantity}.get(kind, kind) for kind in view.kinds}
             self._kind = ui.toggle(kinds, value=view.kinds[0], on_change=self._update).props(
                 "no-caps padding='2px 12px'"
             )
@@ -90,9 +90,12 @@ class RssiPage:
                 self._height = slider("height", low, high, round(middle, 2), "m", self._update, step=0.01)
             column.set_visibility(high > low)
         with ui.column().classes("w-full gap-0") as self._limits:
-            self._threshold = slider("above", -110, -30, self._view.threshold, "dBm", self._update)
+            low, high, step = self._view.limits
+            name, value, unit = self._view.direction, self._view.threshold, self._view.unit
+            self._threshold = slider(name, low, high, value, unit, self._update, step)
             self._certainty = slider("certainty", 50, 99, 90, "%", self._update)
-            numbers = {0: "at this receiver", 1: "at any receiver"}
+            numbers: dict[int | str, str] = {0: "at this receiver", 1: "at any receiver"}
+            numbers |= {band: f"at any receiver of {band}" for band in self._view.rows.receivers_by_band}
             numbers |= {number: f"at {number} receivers or more" for number in range(2, len(names) + 1)}
             numbers = numbers if len(names) > 1 else {0: numbers[0]}
             self._at_least = ui.select(numbers, value=int(len(names) > 1), on_change=self._update)
@@ -138,8 +141,10 @@ class RssiPage:
         height, certainty = round(self._height.value, 3), self._certainty.value / 100
         locating, number = self._view.locating, self._row.value
         row = 0 if locating is None or number is None else locating.numbered(number)
+        chosen = self._at_least.value  # a number of receivers, or a band
+        number, band = (1, chosen) if isinstance(chosen, str) else (chosen, "")
         return MapSelection(
-            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, self._at_least.value
+            self._kind.value, self._receiver.value, height, self._threshold.value, certainty, row, number, band
         )
 
     def _update(self) -> None:

@@ -16,17 +16,23 @@ from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
 from swiftwrf.data.rooms import Rooms
 from swiftwrf.metrics import LEVEL
-from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, at_least, classified, reach
+from swiftwrf.rssi.coverage import CERTAINTY, CLASSES, Coverage, classified, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.pairs import PairModel
+from swiftwrf.rssi.scans import at_least, passing
 
 ANY, TWO = "any receiver", "two receivers"  # of a scan, above the threshold; others are names of receivers
 MAX_SPOTS = 100  # rows of a floor and threshold in the table of weak spots
 
 
 def maps_and_coverage(
-    model: RssiModel | PairModel, train: Rssi, test: Rssi, thresholds_dbm: Sequence[float], rooms: Rooms | None = None
+    model: RssiModel | PairModel,
+    train: Rssi,
+    test: Rssi,
+    thresholds_dbm: Sequence[float],
+    rooms: Rooms | None = None,
+    below: bool = False,
 ) -> tuple[dict[str, NDArray[Any]], list[Values], dict[str, DataFrame]]:
     """Return maps of each floor, their coverage, and tables of it.
 
@@ -38,10 +44,12 @@ def maps_and_coverage(
         test: Test rows without offsets between groups, whose scans are counted.
         thresholds_dbm: Thresholds of the coverage. Maps are those of the first one.
         rooms: Rooms whose coverage is given in a table `rooms`, at any receiver.
+        below: True where smaller is better; see `Coverage.of`.
 
     Returns:
         Arrays (floors, R, H, W) or (floors, H, W) by name; `Coverage.values` of each floor, at the first threshold and any
-        receiver; tables `coverage`, with a row for each floor, threshold and receiver, and `weak_spots`.
+        receiver; tables `coverage`, with a row for each floor, threshold and receiver, `weak_spots`, and, with bands of the
+        receivers, `bands`, with a row for each floor, threshold and band.
 
     Example:
         >>> import swiftwrf
@@ -57,18 +65,20 @@ def maps_and_coverage(
         for rows in (train, test)
     )
     charts = [RssiMap.predict(model, height=height) for height in heights]
-    found, tables, first, of_rooms = [], [], [], []
+    found, tables, first, of_rooms = list[Values](), [], [], []
     for number, (name, height) in enumerate(zip(names, heights, strict=True)):
         scans, held_out = train[of_row == number], test[of_test == number]
         detected = RssiMap.predict(model, height=height, detected=True)
         for threshold in thresholds_dbm:
-            best, *_ = of_floor = _coverages(model, detected, scans, held_out, threshold)
+            best, *_ = of_floor = _coverages(model, detected, (scans, held_out), threshold, below)
             first += [best[0]] if threshold == thresholds_dbm[0] else []
             found += [{"floor": name} | row for _, row in of_floor]
             of_rooms += [] if rooms is None else _of_rooms(rooms, detected, best[0])
             spots = best[0].weak_spots(detected).head(MAX_SPOTS).round(3)
             degrees = degree_columns(train.origin, spots[["x_m", "y_m"]].to_numpy())
-            tables.append(spots.assign(**degrees, floor=name, threshold_dbm=threshold))
+            tables.append(
+                spots.assign(**degrees, floor=name, threshold_dbm=threshold, direction=best[0].values["direction"])
+            )
     lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
     maps: dict[str, NDArray[Any]] = {
         "x": charts[0].x,
@@ -83,12 +93,15 @@ def maps_and_coverage(
         "measured": train.rssi_dbm.numpy(),
         "receiver": train.receiver_position.numpy(),
         "receiver_names": np.array(train.receiver_names),
+        "bands": np.array(train.bands or ()).astype(np.str_),
         "floor_names": np.array(names),
         "floor_of_row": of_row.numpy(),
     }
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
     of_floors = [{"floor": name} | floor.values for name, floor in zip(names, first, strict=True)]
-    every = {"coverage": DataFrame(found), "weak_spots": concat(tables, ignore_index=True)}
+    of_receivers, of_bands = ([row for row in found if key in row] for key in ("receiver", "band"))
+    every = {"coverage": DataFrame(of_receivers), "weak_spots": concat(tables, ignore_index=True)}
+    every |= {"bands": DataFrame(of_bands)} if of_bands else {}
     return maps, of_floors, every if rooms is None else every | {"rooms": DataFrame(of_rooms)}
 
 
@@ -106,35 +119,40 @@ def _of_rooms(rooms: Rooms, chart: RssiMap, coverage: Coverage) -> list[Values]:
                 kind.replace(" ", "_"): float((measured == CLASSES.index(kind)).mean()) if len(measured) else None
                 for kind in reversed(CLASSES[1:])
             }
-            row: Values = {"room": name, "threshold_dbm": coverage.values["threshold_dbm"]}
+            row: Values = {"room": name} | {key: coverage.values[key] for key in ("threshold_dbm", "direction")}
             row |= {"area_m2": len(of_room) * chart.cell**2, "not_measured": float((of_room == 0).mean())} | shares
-            strongest = chart.mean[:, within[..., room]].mean(axis=1).argmax()
-            found.append(row | {"best_receiver": chart.receiver_names[strongest]})
+            of_receiver = chart.mean[:, within[..., room]].mean(axis=1)
+            best = of_receiver.argmin() if coverage.values["direction"] == "below" else of_receiver.argmax()
+            found.append(row | {"best_receiver": chart.receiver_names[best]})
     return found
 
 
 def _coverages(
-    model: RssiModel | PairModel, chart: RssiMap, scans: Rssi, held_out: Rssi, threshold_dbm: float
+    model: RssiModel | PairModel, chart: RssiMap, parts: tuple[Rssi, Rssi], threshold_dbm: float, below: bool
 ) -> list[tuple[Coverage, Values]]:
-    """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans."""
-    names, found, fields, distance = chart.receiver_names, [], None, reach(model)
+    """Return the coverage of any, of two and of each receiver and by band, with the predicted and counted test scans.
+
+    The parts are the scans and the test rows on the floor. That of a band is that of any of its receivers.
+    """
+    names, found, fields, distance, (scans, held_out) = chart.receiver_names, [], None, reach(model), parts
     if len(held_out) and not held_out.receiver_moves:
         prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
         assert prediction.std is not None
         fields = prediction.mean.T, prediction.std.T, detection.T
-    every = list(range(len(names)))
-    chosen = [(ANY, every, 1), (TWO, every, 2)] if len(names) > 1 else []
-    chosen += [(name, [column], 1) for column, name in enumerate(names)]
-    for receiver, columns, number in chosen:
+    every, limit = list(range(len(names))), (threshold_dbm, model.scan_correlation, below)
+    chosen = [("receiver", ANY, every, 1), ("receiver", TWO, every, 2)] if len(names) > 1 else []
+    chosen += [("receiver", name, [column], 1) for column, name in enumerate(names)]
+    chosen += [("band", name, columns, 1) for name, columns in scans.receivers_by_band.items()]
+    for kind, which, columns, number in chosen:
         part = chart if columns == every else chart.receivers([names[column] for column in columns])
-        coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance)
-        row: Values = {"receiver": receiver} | coverage.values
+        coverage = Coverage.of(part, scans.columns(columns), (threshold_dbm, CERTAINTY, number), distance, below)
+        row: Values = {kind: which} | coverage.values
         if fields is not None:
             mean, std, detection = (field[columns] for field in fields)
-            above = (held_out.rssi_dbm[:, columns] > threshold_dbm).sum(dim=1) >= number
+            above = passing(held_out.rssi_dbm[:, columns], threshold_dbm, number, below)
             row |= {
                 "n_test": len(held_out),
-                "test_predicted": float(at_least(number, mean, std, detection, threshold_dbm).mean()),
+                "test_predicted": float(at_least(number, mean, std, detection, *limit).mean()),
                 "test_above": float(above.double().mean()),
             }
         found.append((coverage, row))

@@ -33,12 +33,12 @@ from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
 from swiftwrf.rssi.base import RssiPredictor
-from swiftwrf.rssi.coverage import default_threshold
+from swiftwrf.rssi.coverage import default_threshold, smaller_is_better
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.runtime.checkpoint import Saved, load
-from swiftwrf.runtime.validation import Fraction, Preset, checked
+from swiftwrf.runtime.validation import Fraction, PositiveInt, Preset, checked
 
 DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors
 
@@ -59,8 +59,10 @@ class RssiComparison(Comparison):
         predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
+        below: Thresholds where smaller is better, e.g. of latency, in place of `above`.
         region: Mean absolute errors [dB] of both in a fifth of the area, fitted to the training rows elsewhere.
         rooms: Rooms whose coverage is recorded.
+        repeats: Median and mean absolute errors [dB] of each method by the `seed` of the split, a row each.
 
     Example:
         >>> import swiftwrf
@@ -78,8 +80,10 @@ class RssiComparison(Comparison):
     predictors: Mapping[str, RssiPredictor] = field(default_factory=dict)
     by_rows: DataFrame = field(default_factory=DataFrame)
     above: tuple[float, ...] = ()
+    below: tuple[float, ...] = ()
     region: Mapping[str, float] = field(default_factory=dict)
     rooms: Rooms | None = None
+    repeats: DataFrame = field(default_factory=DataFrame)
 
     @property
     def model(self) -> str:
@@ -89,7 +93,13 @@ class RssiComparison(Comparison):
     def thresholds(self) -> tuple[tuple[float, ...], str | None]:
         """Thresholds of the coverage [dBm], the first one that of maps, and the reason for a default."""
         default, reason = default_threshold(self.train)
-        return (self.above, None) if self.above else ((default,), reason)
+        given = self.above or self.below
+        return (given, None) if given else ((default,), reason)
+
+    @property
+    def is_below(self) -> bool:
+        """True if values below the thresholds are covered: those of `below`, or the default where smaller is better."""
+        return bool(self.below) or (not self.above and smaller_is_better(self.train.quantity))
 
     @cached_property
     def predictions(self) -> DataFrame:
@@ -114,11 +124,22 @@ class RssiComparison(Comparison):
         """Return a row for each method: errors [dB], and their mean difference to those of `model`; see `method_summary`.
 
         `detection` is the balanced accuracy of predicting which test cells are empty, if there are empty ones: the mean of
-        the fractions of detected and of empty cells that are predicted as such.
+        the fractions of detected and of empty cells that are predicted as such. With `repeats` there are mean and standard
+        deviation of median and mean error over the splits.
         """
         table = super().summary()
+        for name, column in self._over_repeats.items():
+            table[name] = column
         right = {name: sum(value["detection"]) / 2 for name, value in self.values.items() if value.get("detection")}
         return table.assign(detection=table.index.map(right)) if right else table
+
+    @property
+    def _over_repeats(self) -> DataFrame:
+        """Mean and standard deviation over splits of the median and the mean error, a row for each method."""
+        if not len(self.repeats):
+            return DataFrame()
+        found = self.repeats.groupby("method", sort=False)[["median", "mean"]].agg(["mean", "std"])
+        return found.set_axis([f"{error}_{kind}" for error, kind in found.columns], axis=1)
 
     @property
     def notes(self) -> list[str]:
@@ -158,7 +179,8 @@ class RssiComparison(Comparison):
     def recorded(self) -> Recorded:
         recorded, attenuation = super().recorded(), self._fitted.attenuation
         test = self.test if self.train.offsets is None else self.train.offsets.removed(self.test)
-        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, self.thresholds[0], self.rooms)
+        covered = self.thresholds[0], self.rooms, self.is_below
+        maps, coverage, tables = maps_and_coverage(self._fitted, self.train, test, *covered)
         at_receiver, none = summaries(self.errors, ["receiver", "method"], [self.column]), {self.column: summary([])}
         metrics = {
             "left_out": self.left_out,
@@ -173,6 +195,10 @@ class RssiComparison(Comparison):
             "interval": {"nominal": LEVEL, "coverage": self.coverage},
             "coverage": coverage,
             "threshold": self.thresholds[1],
+            "repeats": self._over_repeats.assign(
+                n=self.repeats["seed"].nunique() if len(self.repeats) else 0
+            ).T.to_dict(),
+            "bands": tables["bands"].to_dict("records") if "bands" in tables else [],
             "rooms": [] if self.rooms is None else list(self.rooms.names),
             "by_rows": {str(n): {str(name): mean for name, mean in row.items()} for n, row in self.by_rows.iterrows()},
             "region": dict(self.region),
@@ -182,6 +208,8 @@ class RssiComparison(Comparison):
             },
         }
         tables |= {"errors": self.errors, "predictions": self.predictions}
+        named = {kind: f"{kind}_{self.column}" for kind in ("median", "mean")}
+        tables |= {"repeats": self.repeats.rename(columns=named)} if len(self.repeats) else {}
         return replace(recorded, metrics=recorded.metrics | metrics, tables=tables, arrays={"maps": maps})
 
     @property
@@ -223,7 +251,9 @@ def compare(
     not_detected: NotDetected = "auto",
     validation: Validation | Literal["auto"] = "auto",
     fewer: Sequence[Fraction] = (),
+    repeats: PositiveInt = 1,
     above: Sequence[float] = (),
+    below: Sequence[float] = (),
     rooms: Rooms | None = None,
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
@@ -245,7 +275,9 @@ def compare(
         validation: Folds that choose all settings: "random", "block" or "session". Defaults to those like the test rows.
         fewer: Fractions of the training rows that the model and "knn" are fitted to, too, e.g. (0.25, 0.5). After a random
             split both then predict a region of the training rows by all others.
+        repeats: Number of splits, with seeds from `seed` on. Maps and tables are those of the first one.
         above: Thresholds of the coverage [dBm], the first one that of maps. Defaults to -67 for Wi-Fi, else -75.
+        below: Thresholds of another quantity than RSSI, where smaller is better, e.g. latency; in place of `above`.
         rooms: Rooms whose coverage is recorded; see `swiftwrf.data.rooms.read_rooms`.
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
@@ -264,10 +296,16 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    given = {name: value for name, value in locals().items() if name not in ("above", "rooms")}  # which change no step
+    given = {
+        name: value for name, value in locals().items() if name not in ("above", "below", "rooms")
+    }  # which change no step
+    if below and (above or data.is_power):
+        raise InputError("below is for another quantity than RSSI, e.g. latency, in place of above; use above")
     chosen = data.as_measured().receivers(receivers)
     small = is_small(chosen, split)
     train, test = (chosen, chosen) if small else chosen.split(split, seed)
+    if repeats > 1 and (small or split in chosen.named_splits):
+        raise InputError(f"repeats need a split with a seed: random, block or place; {data.name} has one split")
     if not bool(test.detected.any()):
         raise InputError(f"split {split!r} of {data.name} has no test rows that detect these receivers")
     pool = data if small else pool_of(data, train, test, split, seed)
@@ -288,7 +326,7 @@ def compare(
             )
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
-    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), rooms=rooms)
+    begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), below=tuple(below), rooms=rooms)
     model_name, predictors = begun.model, dict[str, RssiPredictor]()
     parallel = None if executor is None else executor.map
 
@@ -344,18 +382,44 @@ def compare(
         predictor.fit(train.subset(others), pool=pool.subset(others), device=device, parallel=parallel)
         return float((predictor.predict_detected(asked).mean - asked.rssi_dbm)[asked.detected].abs().mean())
 
+    def repeat(_: None, folder: Path, number: int) -> Values:
+        again = compare(
+            data,
+            receivers=receivers,
+            split=split,
+            seed=seed + number,
+            also=also,
+            preset=preset,
+            reference=reference,
+            not_detected=not_detected,
+            validation=validation,
+            device=device,
+            executor=executor,
+        )
+        return {name: {"median": found["median"], "mean": found["mean"]} for name, found in again.values.items()}
+
     memo = keep or Memo()
     with refusing_executor(executor):
         steps = Steps(None, memo)
         started = [steps.start(name, name, compute, name) for name in names]
         if fewer:
             steps.start("fewer rows", "fewer rows", study)
+        others = [
+            steps.start(f"split {number + 1}", f"split {number + 1}", repeat, number) for number in range(1, repeats)
+        ]
         values = {name: steps[name] for name in started}
         studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}
         by_rows = DataFrame.from_dict(studies["rows"], orient="index")
+        splits = [values, *(steps[name] for name in others)] if others else []
         if model_name in names and model_name not in predictors:
             model = load(memo.folder / MODEL)
             assert isinstance(model, RssiModel | PairModel)
             predictors[model_name] = model
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
-    return replace(begun, values=values, predictors=predictors, by_rows=by_rows, region=studies["region"])
+    errors = [
+        {"method": name, "seed": seed + number, "median": found[name]["median"], "mean": found[name]["mean"]}
+        for number, found in enumerate(splits)
+        for name in found
+    ]
+    begun = replace(begun, by_rows=by_rows, region=studies["region"], repeats=DataFrame(errors))
+    return replace(begun, values=values, predictors=predictors)

@@ -31,10 +31,11 @@ from swiftwrf.gp import subsample
 from swiftwrf.metrics import LEVEL
 from swiftwrf.plotting import Displayed
 from swiftwrf.positions import check_positions, inside
-from swiftwrf.rssi.coverage import Coverage, at_least, reach
+from swiftwrf.rssi.coverage import Coverage, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.path_loss import log_distance
+from swiftwrf.rssi.scans import at_least
 from swiftwrf.runtime.threads import single_thread
 from swiftwrf.runtime.validation import NonNegativeInt, checked
 
@@ -330,8 +331,8 @@ class _Area:
             z = (mean.mean(dim=0) - curve.limit[:, None]) / (self.std[columns].square() + curve.width**2).sqrt()
             shifted = (1 - curve.missed[:, None]) * torch.special.ndtr(z)
             detection = shifted.where(change_db[columns, None] != 0, detection)
-        std = noise.expand(-1, len(self.position))
-        return torch.stack([1 - at_least(1, each, std, detection, self.threshold_dbm) for each in mean])
+        std, limit = noise.expand(-1, len(self.position)), (self.threshold_dbm, self.model.scan_correlation)
+        return torch.stack([1 - at_least(1, each, std, detection, *limit) for each in mean])
 
     def further(self, place: Tensor, loss: Tensor, fields: Tensor) -> Tensor:
         """Return the probability that a further receiver at a place (3,) [m] is not above the threshold, samples (S, n)."""

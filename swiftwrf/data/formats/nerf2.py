@@ -60,7 +60,7 @@ TABLES = ("gateway_rssi.csv", "rssi.csv")
 POSITIONS = ("tx_pos.csv", "rx_pos.csv", "beacon_pos.csv")
 RECEIVERS = ("gateway_position.yml", "gateway_pos.csv")
 # in survey.yml
-PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels", "plan_scale", "margin_db")
+PROPERTIES = ("origin", "floors", "receiver_moves", "groups", "offsets", "labels", "bands", "plan_scale", "margin_db")
 FILES = ("gateway_rssi.csv", *POSITIONS, *RECEIVERS)  # any of which marks the layout
 
 
@@ -241,7 +241,9 @@ class Nerf2Rssi(Format[Rssi]):
         fillers = sorted({NOT_DETECTED_DBM, *find_fillers(rssi)}) if options.filler is None else list(options.filler)
         rssi, notes = without_fillers(rssi, fillers)
         row = torch.from_numpy(~omitted).nonzero()[:, 0]
-        receiver_position, unknown = read_receivers(receivers, names, None, PlanFrame()) if receivers else (None, [])
+        receiver_position, unknown, bands = None, list[str](), None
+        if receivers:
+            receiver_position, bands, unknown = read_receivers(receivers, names, None, PlanFrame())
         if position_file.name == "rx_pos.csv":
             missing.append(
                 "the receiver moves; RSSI is reciprocal, so it counts as the transmitter and the others as receivers"
@@ -265,7 +267,7 @@ class Nerf2Rssi(Format[Rssi]):
             named_splits=kept_splits(read_splits(path, len(rssi), first=0), row, len(rssi)),
             source=digests([file for file in stated if file], path),
             notes=(*notes, *missing, *unknown, *units),
-            **properties,
+            **({"bands": bands} | properties if bands else properties),
             **{name: values[~omitted] for name, values in of_rows.items()},
         )
 
@@ -313,6 +315,9 @@ def _properties(file: Path) -> dict[str, Any]:
         if not isinstance(labels := content.get("labels", []), list):
             raise TypeError(f"labels is {labels}, expected a list")
         properties["labels"] = tuple(map(str, labels))
+        if not isinstance(bands := content.get("bands", []), list):
+            raise TypeError(f"bands is {bands}, expected a list")
+        properties["bands"] = tuple(map(str, bands)) or None
         offsets = content.get("offsets", {})
         db = offsets.get("offset_db", {})
         values = numbers([content.get("plan_scale", "0"), offsets.get("explained", "0"), *db.values()], len(db) + 2)

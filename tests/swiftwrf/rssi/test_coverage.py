@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.path import Path
+from pandas.testing import assert_frame_equal
 from scipy.integrate import quad
 from scipy.spatial.distance import cdist
 from scipy.stats import norm
@@ -16,9 +17,10 @@ from test_not_detected import RECEIVER, survey
 
 from swiftwrf import PairModel, Rssi, RssiModel, rssi_room
 from swiftwrf.gp import Kernel
-from swiftwrf.rssi.coverage import Coverage, at_least, default_threshold, reach
+from swiftwrf.rssi.coverage import Coverage, default_threshold, reach
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import log_distance
+from swiftwrf.rssi.scans import at_least
 
 MEAN, STD, DETECTED = np.array([-70.0, -78.0, -74.0]), np.array([4.0, 6.0, 5.0]), np.array([0.9, 1.0, 0.6])
 
@@ -167,6 +169,29 @@ def _hull(points):
     return corners
 
 
+def test_below_a_threshold_is_the_mirror_image_of_above():
+    """Coverage and weak spots are equal if map, scans and threshold change their signs."""
+    generator = np.random.default_rng(7)
+    x, y = np.arange(0.5, 12), np.arange(0.5, 9)
+    mean, std = generator.normal(40, 12, (2, 9, 12)).astype(np.float32), np.full((2, 9, 12), 3.0, np.float32)
+    at, values = np.c_[generator.random((40, 2)) * (11, 8), np.zeros(40)], generator.normal(40, 12, (40, 2))
+    values[generator.random((40, 2)) < 0.2] = math.nan  # lost requests pass neither way
+    found = []
+    for sign in (1, -1):
+        chart = RssiMap(x, y, 0.0, 1.0, sign * mean, std, np.ones_like(std), ("a", "b"), quantity="latency", unit="ms")
+        scans = Rssi(sign * values, at, quantity="latency", unit="ms")
+        coverage = Coverage.of(chart, scans, (sign * 45.0, 0.9, 1), 2.0, below=sign < 0)
+        spots = coverage.weak_spots(chart)
+        assert len(spots)
+        shares = {name: value for name, value in coverage.values.items() if name not in ("threshold_dbm", "direction")}
+        found.append((coverage.probability, spots, shares))
+    (above, spots, shares), (below, mirrored, of_mirror) = found
+    np.testing.assert_allclose(above, below)
+    assert_frame_equal(spots, mirrored)
+    assert shares == of_mirror
+    assert shares["scans_above"] == np.mean(np.nanmax(np.c_[values, np.full(40, -999)], axis=1) > 45)
+
+
 def test_a_scan_at_the_threshold_is_not_above_it():
     chart = RssiMap(np.arange(2.0), np.arange(2.0), 1.0, 1.0, *(np.ones((2, 2, 2), np.float32),) * 3, ("a", "b"))
     rows = Rssi([[-75.0, -90], [-74, -90], [math.nan, -75], [-80, -60]], np.random.default_rng(0).random((4, 3)))
@@ -236,6 +261,26 @@ def test_unknown_positions_of_receivers_leave_the_coverage_as_it_is():
         assert Coverage.of(chart, data, (-75.0, 0.9, 1)).values["covered"] > 0.99
 
 
+def test_coverage_of_receivers_with_common_errors_is_that_of_counted_scans():
+    """Six networks of one access point: 0.2 as correlation predicts 6 points or more too many scans."""
+    generator = np.random.default_rng(5)
+    at = np.c_[generator.random((600, 2)) * (30, 12), np.ones(600)]
+    power = -40 - 25 * np.log10(np.hypot(at[:, 0] - 5, at[:, 1] - 6) + 1) + generator.normal(0, 4.5, 600)
+    rows = Rssi(power[:, None] + generator.normal(0, 2.5, (600, 6)), at)
+    train, test = rows.subset(torch.arange(400)), rows.subset(torch.arange(400, 600))
+    model = RssiModel().fit(train)
+    assert model.scan_correlation >= 0.6
+    found = model.predict_detected(test)
+    fields = found.mean.T, found.std.T, torch.ones_like(found.mean.T)
+    passed = (test.rssi_dbm > -65).any(dim=1).double().mean()
+    chosen, usual = (float(at_least(1, *fields, -65.0, rho).mean() - passed) for rho in (model.scan_correlation, 0.2))
+    assert abs(chosen) < 0.05
+    assert usual > 0.06
+    chart = RssiMap.predict(model, 2.0, detected=True)
+    expected = at_least(1, *map(torch.tensor, (chart.mean, chart.std, chart.detection)), -65.0, model.scan_correlation)
+    np.testing.assert_allclose(Coverage.of(chart, train, (-65.0, 0.9, 1)).probability, expected)
+
+
 def test_held_out_scans_pass_as_predicted():
     """At thresholds that half to nine tenths of the scans pass, on floors that the correlation was not chosen by."""
     predicted, passed = [], []
@@ -247,7 +292,7 @@ def test_held_out_scans_pass_as_predicted():
         detection = model.predict_detection(test.transmitter_position).T
         for quantile in (0.1, 0.3, 0.5):
             threshold = float(strongest.quantile(quantile)) - 0.5
-            predicted.append(at_least(1, *fields, detection, threshold).numpy())
+            predicted.append(at_least(1, *fields, detection, threshold, model.scan_correlation).numpy())
             passed.append((strongest > threshold).numpy())
     predicted, passed = np.stack(predicted), np.stack(passed)
     expected = passed.mean(axis=1).reshape(-1, 3).mean(axis=0)  # of all floors

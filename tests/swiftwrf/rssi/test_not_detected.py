@@ -43,6 +43,13 @@ def test_maps_below_the_limit_have_the_noise_of_packets():
     assert RssiModel(not_detected="unknown").fit(data).kernel.noise < 0.3
 
 
+def test_small_noises_alone_leave_a_field_where_empty_cells_are_limits():
+    data, _ = survey(packet_db=0.3)
+    model = RssiModel(not_detected="weak", noises=(0.03, 0.1)).fit(data)
+    assert model.kernel.noise == 0.1
+    assert bool(model.field_db.any())
+
+
 @pytest.fixture(scope="module")
 def fitted():
     data, truth = survey()

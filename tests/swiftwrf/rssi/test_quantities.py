@@ -112,3 +112,25 @@ def test_models_of_power_are_refused(tmp_path):
     model = RssiModel().fit(data)
     with pytest.raises(InputError, match=r"was fitted to throughput"):
         model.update(swiftwrf.rssi_room(n=20).columns([0]))
+
+
+def test_repeats_are_comparisons_of_other_seeds():
+    """Mean and standard deviation over splits, in the summary, the recorded values and the answer."""
+    data = read()
+    alone = {
+        seed: swiftwrf.rssi.compare(data, seed=seed).errors.groupby("method")["abs_error_db"].agg(["median", "mean"])
+        for seed in (2, 3, 4)
+    }
+    result = swiftwrf.rssi.compare(data, seed=2, repeats=3)
+    over, table = result.recorded().metrics["repeats"], result.summary()
+    for name in ("swiftwrf", "knn"):
+        for kind in ("median", "mean"):
+            each = [alone[seed].loc[name, kind] for seed in alone]
+            assert over[name][f"{kind}_mean"] == pytest.approx(np.mean(each), rel=1e-3)
+            assert over[name][f"{kind}_std"] == pytest.approx(np.std(each, ddof=1), rel=1e-2)
+            assert table.loc[name, f"{kind}_std"] == pytest.approx(np.std(each, ddof=1), rel=1e-2)
+    assert over["knn"]["median_std"] > 0
+    text = f"swiftwrf {np.mean([alone[seed].loc['swiftwrf', 'median'] for seed in alone]):.2f} Mbps"
+    assert f"Median errors over 3 splits: {text}" in " ".join(result.answer().conclusion)
+    with pytest.raises(InputError, match="repeats need a split with a seed"):
+        swiftwrf.rssi.compare(data.subset(torch.arange(8)), repeats=2)

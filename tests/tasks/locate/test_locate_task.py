@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from hashlib import sha256
 from unittest import mock
 
 import numpy as np
@@ -241,6 +242,8 @@ def test_rooms_of_rows_are_counted_and_predicted(tmp_path, capsys):
     pd.DataFrame(corners, columns=["x", "y", "room"]).to_csv(tmp_path / "rooms.csv", index=False)
     source = write_rssi(tmp_path / "walk.csv", data)
     assert run("--data", source, "--out", out) == 0
+    read = json.loads((out / "environment.json").read_text())["input_sha256"]
+    assert read["rooms.csv"] == sha256((tmp_path / "rooms.csv").read_bytes()).hexdigest()
     table, errors = pd.read_csv(out / "rooms.csv"), pd.read_csv(out / "errors.csv")
     own = errors[errors["method"] == "posterior"]
     assert table["index"].tolist() == own["index"].tolist()

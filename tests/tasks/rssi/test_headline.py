@@ -2,6 +2,7 @@
 
 import json
 import re
+from hashlib import sha256
 from html import unescape
 
 import numpy as np
@@ -151,6 +152,8 @@ def test_weak_spots_are_listed_from_the_largest(building):
 
 def test_rooms_have_the_coverage_of_their_cells(building):
     folder, _ = building
+    read = json.loads((folder / "environment.json").read_text())["input_sha256"]
+    assert read["rooms.csv"] == sha256((folder.parent / "rooms.csv").read_bytes()).hexdigest()
     table = pd.read_csv(folder / "rooms.csv").set_index("room")
     with np.load(folder / "maps.npz") as stored:
         maps = dict(stored)
