@@ -40,6 +40,13 @@ BINARIES: Registry[pd.DataFrame] = Registry(
 )
 TABLES = (*SUFFIXES, *DOCUMENTS, *PACKED, *BINARIES)  # of tables that are named
 SEPARATORS = ",;\t"
+# cells of a row of a log of the KrakenSDR, before four reserved ones and the values of its spectrum
+# (github.com/krakenrf/krakensdr_docs/wiki, CSV format)
+KRAKEN_LOG = (
+    *("timestamp", "bearing", "confidence", "rssi", "frequency_hz", "array_type", "latency_ms", "station", "latitude"),
+    *("longitude", "heading", "compass_heading", "heading_sensor"),
+)
+KRAKEN_RESERVED = ["R"] * 4
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 
 
@@ -219,17 +226,24 @@ def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
     if not lines:
         raise InputError(f"{source} is empty; expected a header and one row a measurement")
-    if header and _holds_values(lines[0]):
+    first, end = [cell.strip() for cell in lines[0]], len(KRAKEN_LOG)
+    is_kraken = first[end : end + len(KRAKEN_RESERVED)] == KRAKEN_RESERVED
+    if is_kraken:
+        lines = [[*KRAKEN_LOG], *(line[:end] for line in lines)]
+    elif header and _holds_values(lines[0]):
         raise InputError(
             f"{source} has no header, its first line holds numbers; write the names of the columns above it"
         )
-    if not header:
+    elif not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
     if separator != "," or '"' in text:
         lines = [lines[0], *with_decimal_points(lines[1:], quoted=separator == ",")]
     names, rows, notes = _regular(source, lines)
     table = pd.DataFrame(rows, columns=names, dtype=object)
-    table.attrs["notes"] = notes
+    bearings = (
+        "a log of a KrakenSDR, whose first line holds values: its bearings and spectra are of an array that moves"
+    )
+    table.attrs["notes"] = [f"{bearings}, and are not used"] * is_kraken + notes
     return table
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from swiftwrf.data.cells import (
     parsed,
@@ -22,6 +23,7 @@ from swiftwrf.data.cells import (
     text_of,
 )
 from swiftwrf.data.columns import (
+    ACCURACY,
     GEODETIC,
     SNR,
     TRANSMITTED,
@@ -58,7 +60,7 @@ from swiftwrf.data.radios import (
 )
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.scans import held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.scans import bad_fixes, held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
 from swiftwrf.data.zones import zone_column
 from swiftwrf.errors import InputError, listed
 
@@ -104,6 +106,7 @@ class _Survey:
         end: Columns of the second end by x, y and z.
         names: Names of the R receivers.
         left_out: Columns of other quantities than the received power.
+        accuracy: Column with the stated accuracy of fixes, None without one.
         relays: Columns that count the relays of a packet, none without these.
         corrected: Column of the transmit power that is subtracted, empty without one.
         unused: Columns without use.
@@ -146,9 +149,11 @@ class _Survey:
         if self.names:
             several = f"RSSI of {len(self.names)} receivers = {listed(self.names)}"
             taken.append(several if len(self.names) > 1 else f"RSSI = {self.names[0]}")
-        self.notes += [f"taken as: {', '.join(taken)}", *notes]
+        self.accuracy = next((n for n in self._named(ACCURACY) if not parsed(table[n])[1].any()), None)
+        taken += [f"accuracy of fixes = {self.accuracy}"] * (self.accuracy is not None)
         self.relays = [name for name in relay_columns(table) if name not in (*used, *self.roles.values())]
-        used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays}
+        used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays, self.accuracy}
+        self.notes += [f"taken as: {', '.join(taken)}", *notes]
         self.unused = [name for name in table.columns if name not in used]
         if self.unused:
             self.notes.append(f"columns that are not used: {listed(self.unused)}")
@@ -245,9 +250,20 @@ class _Survey:
                 f"rows that repeat a held fix, before a jump to the next one, are left out: {held.sum()} of {len(row)}"
             )
             row = row[~held]
+        if not keeps_rows:
+            row, of_accuracy = self._accurate(row)
+            notes += of_accuracy
         self.notes += notes
         self.index, self.table_row = row, self.table_row.max(axis=1)[row]
         self.rssi, self.coordinate = self.rssi[row], self.coordinate[row]
+
+    def _accurate(self, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
+        """Return the rows without fixes whose stated accuracy is bad, and a note on these."""
+        if self.accuracy is None:
+            return row, []
+        bad, limit = bad_fixes(parsed(self.table[self.accuracy])[0][self.table_row.max(axis=1)[row]])
+        note = f"fixes with {self.accuracy} above {limit:.3g} are left out: {bad.sum()} of {len(row)} rows"
+        return row[~bad], [note] * bool(bad.any())
 
     def project(self) -> None:
         """Project degrees to local metres, and leave out receivers that never detected the transmitter."""
