@@ -17,16 +17,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from swiftwrf.data.cells import (
-    parsed,
-    plain_name,
-    text_of,
-)
+from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.columns import (
     ACCURACY,
     GEODETIC,
     SNR,
     TRANSMITTED,
+    candidates,
     check_receiver_known,
     column_of,
     column_of_quantity,
@@ -36,28 +33,22 @@ from swiftwrf.data.columns import (
     receiver_columns,
     relay_columns,
 )
-from swiftwrf.data.coordinates import (
-    PlanFrame,
-    floors_of,
-    without_fix,
-)
+from swiftwrf.data.coordinates import PlanFrame, floors_of, without_fix
 from swiftwrf.data.options import TableOptions
 from swiftwrf.data.packets import rows_of_packets, without_relayed
 from swiftwrf.data.places import local_metres, read_coordinates, receivers_of_ends
 from swiftwrf.data.powers import (
+    RSSI_UNITS,
     check_powers,
     end_of_scale,
     find_fillers,
+    in_dbm,
     of_one_power,
     powers_in,
     signal_power,
     without_fillers,
 )
-from swiftwrf.data.radios import (
-    pooled,
-    pools_by,
-    propose_pools,
-)
+from swiftwrf.data.radios import pooled, pools_by, propose_pools
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.scans import bad_fixes, held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
@@ -133,6 +124,10 @@ class _Survey:
             asked["rssi"] = column_of_quantity(source, table, options.quantity)
         table, self.n_listed, notes = from_ranked_lists(table, asked)
         self.notes += notes
+        if options.unit in RSSI_UNITS and options.quantity is None:
+            names = [asked["rssi"]] if asked.get("rssi") in table else fnmatch.filter(table, asked.get("rssi", ""))
+            table, notes = in_dbm(source, table, names or candidates(table, "rssi")[:1], options.unit)
+            self.notes += notes
         self.table, self.names, self.end, self.corrected = table, list[str](), dict[str, str](), ""
         if len(options.transmitter) == 1:
             asked["receiver"] = options.transmitter[0]
@@ -325,7 +320,8 @@ class _Survey:
             if moves:
                 raise InputError(f"{self.source} has positions of both ends, which only a model of RSSI takes; {what}")
         elif receivers is not None and receiver_position is None:
-            known, notes = read_receivers(receivers, self.names, self.origin, self.frame)
+            stated = options.receiver_positions is not None
+            known, notes = read_receivers(receivers, self.names, self.origin, self.frame, stated)
             receiver_position = known.numpy()
             self.notes += notes
         group = self.group.iloc[self.table_row].rename(options.offset_by) if options.offset_by else None
@@ -363,7 +359,7 @@ class _Survey:
             raise InputError(
                 f"{self.source} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
                 f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', or map "
-                "another quantity: quantity and unit"
+                "another quantity: quantity and unit; of RSSI in other units give unit percent or positive"
             )
         if len(self.names) == 1 and "rssi" not in asked and not self.end:
             where = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]

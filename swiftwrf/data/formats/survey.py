@@ -1,6 +1,7 @@
 """Reader of survey tables: positions and RSSI, one column a receiver (wide) or one row a packet (long).
 
-Tables are CSV, maybe compressed or in a workbook, or Parquet, the records in JSON, GPX and KML documents, or logs in databases.
+Tables are CSV, maybe compressed or in a workbook, or Parquet, the records in JSON, GPX and KML documents, or logs in
+databases.
 """
 
 from __future__ import annotations
@@ -38,15 +39,16 @@ class SurveyTable(Format[Rssi]):
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
         file, others, table = _table(path)
-        receivers = file.with_name(RECEIVERS)
-        stated = receivers if receivers.is_file() else None
+        beside = file.with_name(RECEIVERS)
+        receivers = beside if beside.is_file() else None
+        receivers = receivers if options.receiver_positions is None else Path(options.receiver_positions)
         splits = read_splits(file.parent, len(table), first=0)
-        arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
+        arguments = read_survey(file, table, options, receivers, keeps_rows=bool(splits))
         data = Rssi(
             **arguments,
             name=file.stem.removesuffix(".csv"),
             named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
-            source=digests([file, *others, *([stated] if stated else [])], file.parent),
+            source=digests([file, *others, *([receivers] if receivers else [])], file.parent),
         )
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
