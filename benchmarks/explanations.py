@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf" / "diagnostics"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "swiftwrf" / "contrib" / "diagnostics"))
 
 import test_diagnosis as diagnosis
 from record import options, write_result

@@ -141,15 +141,18 @@ ARRAYS = {
     "140-flawless": [FITS, "needs no calibration"],
     "141-several-anchors": ["describes 4 arrays; choose one by its number"],
     "142-carrier-per-packet": ["each row has its carrier, 2.404 to 2.476 GHz", FITS],
-    "143-phase-degrees-as-radians": ["would fit if.* degrees.* as radians"],
+    "143-phase-degrees-as-radians": ["would fit if phases in degrees were taken as radians"],
     "144-magnitude-and-phase": ["140 array snapshots", "Peaks are 2.[0-9] degrees", FITS],
     "145-int8-pairs": ["holds pairs of numbers, read as real and imaginary part", FITS],
     "146-nexmon-neighbours": ["0c:9d:92:aa:01:10 260, f4:6b:8c:22:0b:31 260; choose one"],
     "146-nexmon-neighbours/phone_alone": ["26 array snapshots", "Peaks are 7.3 degrees"],
-    "147-subcarriers-in-fft-order": ["subcarriers.* order of an FFT", FITS],
+    "147-subcarriers-in-fft-order": ["subcarriers.* order of an FFT.*fftshift", FITS],
     "148-elements-in-wavelengths": ["if element_position is in wavelengths"],
     "150-matlab-struct": ["140 array snapshots", FITS],
-    "152-antenna-off-base-link": ["would fit if.* m (in front|behind|ahead|beside)", f"not: {CALIBRATE}|{FITS}"],
+    "152-antenna-off-base-link": [
+        "errors grow towards the array, as of positions that are wrong by about 0.3 m",
+        f"not: {CALIBRATE}|{FITS}",
+    ],
     "153-two-transmitters-in-packets": ["110 array snapshots", f"not: {FITS}|{CALIBRATE}"],
 }
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.contrib.diagnostics.calibration import calibrate
-from swiftwrf.contrib.diagnostics.elements import in_noise, noisy_elements
+from swiftwrf.contrib.diagnostics.elements import in_fft_order, in_noise, noisy_elements
 from swiftwrf.contrib.diagnostics.frames import Frame, check_frames
 from swiftwrf.contrib.diagnostics.path_loss import check_path_loss
 from swiftwrf.data import Rssi, Snapshots, Spectra
@@ -197,6 +197,11 @@ def _check_snapshots(data: Snapshots, findings: Findings) -> None:
     if spacing > ROUGH + 0.01:
         findings.warn(
             "Elements are more than half a wavelength apart, so spectra have several peaks for one direction."
+        )
+    if in_fft_order(data):
+        findings.warn(
+            "Subcarriers look to be in the order of an FFT, from zero frequency, but the carriers ascend: give "
+            "np.fft.fftshift(csi, axes=1). Directions are right, but delays and geometry are not."
         )
     near = float((data.away.norm(dim=1) < data.array.far_field_m).double().mean())
     if near > 0:
