@@ -25,11 +25,12 @@ def channel(folder):
         lambda csi: {"amplitude": abs(csi), "phase_deg": np.rad2deg(np.angle(csi))},
         lambda csi: {"magnitude": abs(csi), "phase_rad": np.angle(csi) + 40 * np.pi},
         lambda csi: {"csi_real": csi.real, "csi_imag": csi.imag},
+        lambda csi: {"h_real": csi.real, "h_imag": csi.imag},
         lambda csi: {"I": csi.real, "Q": csi.imag},
         lambda csi: {"csi": np.stack([csi.real, csi.imag], axis=-1)},
         lambda csi: {"csi": np.stack([csi.real, csi.imag], axis=-1).reshape(*csi.shape[:-1], -1)},
     ],
-    ids=["abs, angle", "degrees", "unwrapped", "real, imag", "I, Q", "pairs", "pairs in turn"],
+    ids=["abs, angle", "degrees", "unwrapped", "real, imag", "h", "I, Q", "pairs", "pairs in turn"],
 )
 def test_two_parts_are_one_channel(tmp_path, known, parts):
     plain = channel(write_snapshots(tmp_path / "plain"))
