@@ -71,7 +71,7 @@ def database(known: str, draw: random.Random, folder: Path) -> None:
         .pivot(index="time", columns="bssid", values="rssi")
         .astype(float)
     )
-    check_powers(load_rssi(file), powers if known == "location" else powers.dropna(how="all"))
+    check_powers(load_rssi(file, filler=[]), powers if known == "location" else powers.dropna(how="all"))
 
 
 def ranked(draw: random.Random, folder: Path) -> None:
@@ -97,7 +97,7 @@ def ranked(draw: random.Random, folder: Path) -> None:
         kept.loc[row, [receivers[at] for at in order]] = values[order]
     lists = lists.assign(**columns)
     lists.to_csv(folder / "lists.csv", index=False)
-    data = load_rssi(folder / "lists.csv")
+    data = load_rssi(folder / "lists.csv", filler=[])
     check_powers(data, kept[receivers].dropna(axis=1, how="all"))
     np.testing.assert_allclose(data.transmitter_position[:, :2], table[["x", "y"]])
 
@@ -124,7 +124,7 @@ def logs(draw: random.Random, folder: Path) -> None:
             since = (table[column] - pd.Timestamp(0)).dt.total_seconds()
             table = table.assign(**{column: since if form == "epoch" else (1000 * since).round().astype("int64")})
         table.to_csv(folder / name, index=False)
-    data = load_rssi(folder)
+    data = load_rssi(folder, filler=[])
     in_gap = np.diff(seconds)[np.searchsorted(seconds, at) - 1] > 10
     expected = np.column_stack([np.interp(at, seconds, column) for column in place(seconds).T])[~in_gap]
     np.testing.assert_allclose(data.transmitter_position[:, :2], expected, atol=2e-3)
