@@ -1,4 +1,4 @@
-"""Small inputs after public reports, each of which was misread once: what inspection says of them, as their READMEs ask.
+"""Small inputs after public reports, each of which was misread once: their inspection contains what their READMEs ask for.
 
 The folder of the cases lies beside that of the measured data. Expressions are looked for in the findings or the refusal.
 """

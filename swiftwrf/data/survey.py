@@ -36,7 +36,7 @@ from swiftwrf.data.columns import (
 from swiftwrf.data.coordinates import PlanFrame, floors_of, without_fix
 from swiftwrf.data.options import TableOptions
 from swiftwrf.data.packets import rows_of_packets, without_relayed
-from swiftwrf.data.places import local_metres, read_coordinates, receivers_of_ends
+from swiftwrf.data.places import floor_column, local_metres, read_coordinates, receivers_of_ends
 from swiftwrf.data.powers import (
     RSSI_UNITS,
     check_powers,
@@ -134,6 +134,10 @@ class _Survey:
         elif options.transmitter or not {"x", "y"} & asked.keys():
             self.end = columns_of_end(source, table, options.transmitter)
         self.roles = find_roles(source, table, asked, self.end.values())
+        if "floor" not in self.roles:
+            taken_columns = {name for role, name in self.roles.items() if role != "rssi"} | {*self.end.values()}
+            other = floor_column(source, table, {*taken_columns, *asked.values(), options.offset_by})
+            self.roles |= {} if other is None else {"floor": other}
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}

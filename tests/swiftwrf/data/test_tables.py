@@ -873,3 +873,30 @@ def test_rssi_in_percent_or_without_sign_is_converted_where_its_unit_is_stated(t
             load_rssi(tmp_path / f"{name}.csv")
     with pytest.raises(InputError, match="choose with columns rssi=NAME"):
         load_rssi(tmp_path / "wide.csv", unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "heights"),
+    [
+        ("Level", [1, 2], {4.0, 8.0}),
+        ("building_level", ["Ground", "Level 2"], {0.0, 8.0}),
+        ("level", ["EG", "1.OG"], {0.0, 4.0}),
+    ],
+)
+def test_levels_with_a_known_order_are_floors(name, values, heights):
+    walk = pd.DataFrame({"x": range(12), "y": 0.0, "ap": -50.0, name: values * 6})
+    data = Rssi.from_frame(walk)
+    assert {*data.transmitter_position[:, 2].tolist()} == heights
+    assert f"floor = {name}" in data.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("Map", ["1", "2"]), ("FloorPlan", ["west", "east"]), ("Level", ["red", "blue"])]
+)
+def test_maps_and_levels_without_order_are_asked_about(name, values):
+    walk = pd.DataFrame({"x": range(12), "y": 0.0, "ap": -50.0, name: values * 6})
+    with pytest.raises(InputError, match=f"is '{name}' .* the floor of each row"):
+        Rssi.from_frame(walk)
+    assert len(Rssi.from_frame(walk, offset_by=name)) == 12
+    one = Rssi.from_frame(walk.assign(**{name: values[0]}))
+    assert len(one) == 12
