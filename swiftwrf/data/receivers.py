@@ -66,8 +66,8 @@ def read_receivers(
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
     if not stated and not {*names} & {*listed_names}:
-        unknown = f"it has none of the receivers ({listed(names)}), but {listed(listed_names)}"
-        return torch.full((len(names), 3), torch.nan, dtype=torch.float64), [f"{file.name} is not used: {unknown}"]
+        reason = f"it has none of the receivers ({listed(names)}), but {listed(listed_names)}"
+        return torch.full((len(names), 3), torch.nan, dtype=torch.float64), [f"{file.name} is not used: {reason}"]
     position = positions_of(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]

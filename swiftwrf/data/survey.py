@@ -136,7 +136,7 @@ class _Survey:
         self.roles = find_roles(source, table, asked, self.end.values())
         if "floor" not in self.roles:
             taken_columns = {name for role, name in self.roles.items() if role != "rssi"} | {*self.end.values()}
-            other = floor_column(source, table, {*taken_columns, *asked.values(), options.offset_by})
+            other = floor_column(source, table, {*taken_columns, *asked.values(), options.offset_by or ""})
             self.roles |= {} if other is None else {"floor": other}
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
