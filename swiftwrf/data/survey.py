@@ -362,8 +362,8 @@ class _Survey:
         if not self.names:
             raise InputError(
                 f"{self.source} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
-                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', or map "
-                "another quantity: quantity and unit; of RSSI in other units give unit percent or positive"
+                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', map another quantity (quantity "
+                "and unit), or give unit percent or positive"
             )
         if len(self.names) == 1 and "rssi" not in asked and not self.end:
             where = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]
