@@ -211,7 +211,9 @@ class ReadingOptions(Options):
     """what the values of a survey table are, if not RSSI: throughput, latency, SNR, ... Maps then have no path loss and no
     limit of detection. Needs --unit, and --columns rssi=NAME unless one column is named so"""
     unit: str | None = None
-    """unit of --quantity"""
+    """unit of --quantity; or of RSSI, if it is not dBm: percent (percent / 2 - 100 dBm), or positive (dBm without sign)"""
+    receiver_positions: str | None = None
+    """table with positions of the receivers of a survey table (default: receivers.csv beside it)"""
     offset_by: str | None = None
     """column of a survey table with groups of rows, e.g. devices, whose constant offsets are estimated; COLUMN=VALUE makes
     that group the reference of maps (default: the most frequent one)"""

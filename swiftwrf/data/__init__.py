@@ -115,6 +115,9 @@ def load_rssi(
     y_down: bool = False,
     up: Up = "z",
     window: PositiveFloat | None = None,
+    quantity: str | None = None,
+    unit: str | None = None,
+    receiver_positions: Path | str | None = None,
 ) -> Rssi:
     """Read RSSI in any format of docs/formats.md: the NeRF2 layout, or a survey table (CSV, Parquet).
 
@@ -134,6 +137,9 @@ def load_rssi(
         y_down: y points down, as in images of floor plans.
         up: Axis that points up, "y" as in ARCore, ARKit and Unity.
         window: Length [s] of the windows in which packets of several receivers are joined to a row by their means.
+        quantity: What the values of a table are, if not RSSI, e.g. throughput.
+        unit: Unit of the quantity. For RSSI that is not in dBm, "percent" or "positive", which are converted.
+        receiver_positions: Table with positions of the receivers. Defaults to receivers.csv beside the data.
 
     Raises:
         InputError: A part that is missing or invalid, parts that do not match, or an argument that does not apply.

@@ -33,7 +33,7 @@ UNITS = {  # of numbers in cells and at the end of names, and how many of them a
     **dict.fromkeys(("min", "minutes"), 1 / 60),
 }
 PIXELS = ("px", "pixel", "pixels")
-OTHER_UNITS = ("dbm", "db", "deg", "degrees", "\u00b0")
+OTHER_UNITS = ("dbm", "db", "%", "deg", "degrees", "\u00b0")
 ANY_UNIT = "|".join(sorted((*UNITS, *PIXELS, *OTHER_UNITS), key=len, reverse=True))
 NUMBER = re.compile(rf"([+-]?\s*(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)\s*({ANY_UNIT}|\u00b0?\s*[nsew])", re.IGNORECASE)
 UNIT_AT_THE_END = re.compile(rf"(?<=[a-z0-9])_({ANY_UNIT})$")

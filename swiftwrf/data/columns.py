@@ -72,6 +72,9 @@ GROUPS_OF_ROWS = re.compile(  # columns that distinguish rows, but not the recei
 MARKS = {"tx": "transmitter", "transmitter": "transmitter", "rx": "receiver", "receiver": "receiver"}  # words in names
 TRANSMITTED = re.compile(r"(?:.*_)?(?:tx_?(?:power|pwr|pow)\w*|transmit\w*_power|power_?tx|eirp|erp)")
 SNR = re.compile(r"(?:.*_)?[le]?snr(?:_(?:mean|avg|median))?")
+ACCURACY = re.compile(
+    rf"(?:{GPS}|h_?|horizontal_?|position_?|fix_?)(?:accuracy|uncertainty|[hp]?dop)(?:_?(?:m|met(?:er|re)s))?"
+)
 HOPS = re.compile(r"(?:n_?)?hops(?:_?(?:away|taken|count))?|hop_?count")  # of packets in a mesh
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
@@ -131,7 +134,8 @@ def find_roles(
     if "receiver" in roles and "rssi" not in roles:
         if "receiver" in asked or len(receiver_columns(table, others)[0]) < 2:
             raise InputError(
-                f"{source} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns rssi=NAME"
+                f"{source} has receivers in column {roles['receiver']!r}, but no RSSI beside; name it with columns "
+                "rssi=NAME, or map another quantity, e.g. the SNR: quantity and unit"
             )
         del roles["receiver"]  # which distinguishes rows of a wide table
     return roles

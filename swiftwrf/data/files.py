@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from swiftwrf.choices import CARRIERS_HZ
-from swiftwrf.data.archives import MAX_UNPACKED_BYTES, PACKED, refusing_broken, unpacked
+from swiftwrf.data.archives import MAX_UNPACKED_BYTES, PACKED, refusing_broken
 from swiftwrf.data.cells import NO_VALUE, column_of_numbers, with_decimal_points
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.runtime.plain import TextLoader
@@ -36,10 +36,23 @@ DOCUMENTS: Registry[pd.DataFrame] = Registry(
 BINARIES: Registry[pd.DataFrame] = Registry(
     "binary file",
     declared=dict.fromkeys((".sqlite", ".sqlite3", ".db", ".kismet"), "swiftwrf.contrib.formats.databases:table_in_log")
-    | dict.fromkeys((".xlsx", ".xls", ".ods"), "swiftwrf.contrib.formats.databases:refuse_workbook"),
+    | dict.fromkeys((".xls", ".ods"), "swiftwrf.contrib.formats.databases:refuse_workbook"),
 )
-TABLES = (*SUFFIXES, *DOCUMENTS, *PACKED, *BINARIES)  # of tables that are named
+# functions that return the text in a file, in UTF-8, from its path and the most bytes
+TEXTS: Registry[bytes] = Registry(
+    "file with a text",
+    declared={".xlsx": "swiftwrf.contrib.formats.databases:text_in_workbook"}
+    | dict.fromkeys(PACKED, "swiftwrf.data.archives:unpacked"),
+)
+TABLES = (*SUFFIXES, *DOCUMENTS, *TEXTS, *BINARIES)  # of tables that are named
 SEPARATORS = ",;\t"
+# cells of a row of a log of the KrakenSDR, before four reserved ones and the values of its spectrum
+# (github.com/krakenrf/krakensdr_docs/wiki, CSV format)
+KRAKEN_LOG = (
+    *("timestamp", "bearing", "confidence", "rssi", "frequency_hz", "array_type", "latency_ms", "station", "latitude"),
+    *("longitude", "heading", "compass_heading", "heading_sensor"),
+)
+KRAKEN_RESERVED = ["R"] * 4
 MAX_TEXT_BYTES = 2**28  # a million rows of positions take a tenth of it
 
 
@@ -82,7 +95,7 @@ def read_bytes(file: Path) -> bytes:
 
 
 def read_text(file: Path) -> str:
-    """Return a text in UTF-8, with or without a byte-order mark, which may be compressed as .gz or .zip.
+    """Return a text in UTF-8, with or without a byte-order mark, which may be compressed as .gz or .zip, or in a workbook.
 
     Raises:
         InputError: The file is missing, larger than 256 MiB, broken, or in another encoding.
@@ -91,7 +104,8 @@ def read_text(file: Path) -> str:
         size = file.stat().st_size
     if size > MAX_TEXT_BYTES:
         raise InputError(f"{file} has {size} bytes; a table or list has at most {MAX_TEXT_BYTES}")
-    content = unpacked(file, MAX_TEXT_BYTES) if file.suffix.lower() in PACKED else read_bytes(file)
+    kind = file.suffix.lower()
+    content = TEXTS[kind](file, MAX_TEXT_BYTES) if kind in TEXTS else read_bytes(file)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -158,7 +172,7 @@ def read_table(file: Path, header: bool = True) -> pd.DataFrame:
         file: A log as in `swiftwrf.contrib.formats.databases`, a document as in `swiftwrf.contrib.formats.documents`,
             Parquet, or one row a line with commas, semicolons or tabs between values; the most frequent one in the header
             counts. Numbers may have a decimal comma, in quotes if the separator is a comma. Lines before the header are
-            skipped. Texts may be compressed as .gz or .zip.
+            skipped. Texts may be compressed as .gz or .zip, or in a workbook (.xlsx).
         header: The first line contains the names of the columns. Otherwise, they are named 1, 2, ...
 
     Returns:
@@ -219,17 +233,24 @@ def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
         lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
     if not lines:
         raise InputError(f"{source} is empty; expected a header and one row a measurement")
-    if header and _holds_values(lines[0]):
+    first, end = [cell.strip() for cell in lines[0]], len(KRAKEN_LOG)
+    is_kraken = first[end : end + len(KRAKEN_RESERVED)] == KRAKEN_RESERVED
+    if is_kraken:
+        lines = [[*KRAKEN_LOG], *(line[:end] for line in lines)]
+    elif header and _holds_values(lines[0]):
         raise InputError(
             f"{source} has no header, its first line holds numbers; write the names of the columns above it"
         )
-    if not header:
+    elif not header:
         lines = [[str(column) for column in range(1, len(lines[0]) + 1)], *lines]
     if separator != "," or '"' in text:
         lines = [lines[0], *with_decimal_points(lines[1:], quoted=separator == ",")]
     names, rows, notes = _regular(source, lines)
     table = pd.DataFrame(rows, columns=names, dtype=object)
-    table.attrs["notes"] = notes
+    bearings = (
+        "a log of a KrakenSDR, whose first line holds values: its bearings and spectra are of an array that moves"
+    )
+    table.attrs["notes"] = [f"{bearings}, and are not used"] * is_kraken + notes
     return table
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pandas as pd
 import torch
 
-from swiftwrf.data.cells import UNITS, Floats, column_of_numbers, parsed, text_of, unit_of
-from swiftwrf.data.columns import GEODETIC
+from swiftwrf.data.cells import UNITS, Floats, column_of_numbers, parsed, plain_name, text_of, unit_of
+from swiftwrf.data.columns import GEODETIC, is_rssi
 from swiftwrf.data.coordinates import (
     MIN_STOREY_M,
     STOREY_M,
@@ -21,8 +22,45 @@ from swiftwrf.data.coordinates import (
     frame_of,
 )
 from swiftwrf.data.zones import in_one_zone, zone_column
-from swiftwrf.errors import InputError
+from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
+
+LEVEL = re.compile(
+    r"(?:(?P<level>(?:building_?)?level|flr|story)|(?:floor_?)?(?:map|plan))(?:_?(?:id|name|no|number))?"
+)
+
+
+def floor_column(source: object, table: pd.DataFrame, taken: Collection[str], max_floors: int = 30) -> str | None:
+    """Return a column with another name than floor whose values are floors, e.g. Level, None without one.
+
+    Args:
+        source: Name of the table, for messages.
+        table: Columns of a survey.
+        taken: Columns with another use.
+        max_floors: Number of different values, at most (not studied).
+
+    Raises:
+        InputError: The question whether a column of maps, or of levels without a known order, contains the floors.
+
+    Example:
+        >>> floor_column("a.csv", pd.DataFrame({"x": [0, 1], "Level": ["Ground", "1st"]}), ["x"])
+        'Level'
+    """
+    for name in table.columns:
+        cells = text_of(table[name])
+        if name in taken or not 2 <= cells.nunique() <= max_floors:
+            continue
+        kind = LEVEL.fullmatch(plain_name(name))
+        if not kind or is_rssi(table[name]):
+            continue
+        if kind["level"] and not np.isnan(floor_numbers(cells[cells != ""].unique().tolist())).any():
+            return str(name)
+        raise InputError(
+            f"{source}: is {name!r} ({listed(cells.unique())}) the floor of each row? Then give --columns "
+            f"floor={name}, with floors in a known order or a column of heights; if not, read each part "
+            "alone, or rename the column"
+        )
+    return None
 
 
 def read_coordinates(

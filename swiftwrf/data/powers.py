@@ -19,6 +19,11 @@ from swiftwrf.errors import InputError
 NOT_DETECTED_DBM = -100.0  # the usual filler
 KNOWN_FILLERS = (NOT_DETECTED_DBM, -200.0, 0.0, 100.0, 127.0)
 MIN_RSSI_DBM, MAX_RSSI_DBM = -150.0, 30.0
+# Microsoft, WLAN_ASSOCIATION_ATTRIBUTES: a quality of 0 is -100 dBm, and of 100 it is -50 dBm
+RSSI_UNITS = {  # beside dBm: largest value, factor and offset to dBm, and what converts so
+    "percent": (100.0, 0.5, -100.0, "RSSI in percent counts as percent / 2 - 100 dBm, the scale of Windows"),
+    "positive": (150.0, -1.0, 0.0, "RSSI without sign counts as negative"),
+}
 
 
 def find_fillers(
@@ -200,6 +205,32 @@ def of_one_power(
     return rssi - np.nan_to_num(transmitted - reference), reference
 
 
+def in_dbm(source: object, table: pd.DataFrame, names: Sequence[str], unit: str) -> tuple[pd.DataFrame, list[str]]:
+    """Return a table whose columns of RSSI in another unit are in dBm, and a note.
+
+    Raises:
+        InputError: No such column, or a value that the unit does not have.
+
+    Example:
+        >>> in_dbm("a.csv", pd.DataFrame({"rssi": [80, 0]}), ["rssi"], "percent")[0].rssi.tolist()
+        [-60.0, -100.0]
+    """
+    if not names:
+        raise InputError(
+            f"{source}: unit {unit} needs the columns of RSSI; choose with columns rssi=NAME or rssi='PREFIX*'"
+        )
+    most, factor, offset, note = RSSI_UNITS[unit]
+    columns = {}
+    for name in names:
+        values, text = parsed(table[name])
+        wrong = values[(values < 0) | (values > most) & ~np.isin(values, KNOWN_FILLERS)]
+        if len(wrong):
+            raise InputError(f"{source}: {name} has the value {wrong[0]:g}; unit {unit} has values of 0 to {most:g}")
+        converted = np.where(values <= most, factor * values + offset, values)
+        columns[name] = table[name].where(text, converted) if text.any() else converted
+    return table.assign(**columns), [note]
+
+
 def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_row: NDArray[np.int64]) -> None:
     """Refuse RSSI (n, R) [dBm] that is no received power.
 
@@ -212,6 +243,11 @@ def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_r
     if not bad.any():
         return
     rows = np.broadcast_to(table_row, rssi.shape)
+    if np.nanmedian(rssi) > 0:
+        raise InputError(
+            f"{source} has positive values of RSSI; if they are dBm without sign, give unit positive, and if they are "
+            "percent, unit percent"
+        )
     row, column = min(np.argwhere(bad), key=lambda cell: rows[tuple(cell)])
     value = rssi[row, column]
     raise InputError(

@@ -40,11 +40,12 @@ def spelled_as(names: Sequence[str], known: Sequence[str]) -> tuple[list[str], l
 
 
 def read_receivers(
-    file: Path, names: Sequence[str], origin: GeodeticOrigin | None, frame: PlanFrame
+    file: Path, names: Sequence[str], origin: GeodeticOrigin | None, frame: PlanFrame, stated: bool = True
 ) -> tuple[Tensor, list[str] | None, list[str]]:
     """Return the positions of receivers, float64 (R, 3) [m], nan where the table lacks one, their bands, and notes.
 
-    A table with a column of bands, channels or frequencies may have no positions.
+    A table with a column of bands, channels or frequencies may have no positions. One that is found beside the data and has
+    none of the receivers is of others, and is not used.
 
     Args:
         file: Table of positions with names of receivers, or without names in the order of the receivers; or YAML with
@@ -52,9 +53,10 @@ def read_receivers(
         names: R names.
         origin: Origin of the measurements, if their positions were in degrees; then these are, too.
         frame: Axes of the measurements, which the receivers share unless their columns state another unit.
+        stated: The user states that the table is of these receivers.
 
     Raises:
-        InputError: A name twice, no position of any receiver, or a position that is not usable.
+        InputError: A name twice, no position of any receiver if it is stated, or a position that is not usable.
     """
     table = _positions_by_name(file, names) if file.suffix == ".yml" else read_table(file)
     name_column = column_of(table, "receiver", {}) or ("name" if "name" in table.columns else None)
@@ -64,9 +66,13 @@ def read_receivers(
     if len(set(listed_names)) < len(listed_names):
         raise InputError(f"{file} must have each receiver once, got {listed(listed_names)}")
     listed_names, notes = spelled_as(listed_names, names)
+    nowhere = torch.full((len(names), 3), torch.nan, dtype=torch.float64)
+    if not stated and not {*names} & {*listed_names}:
+        reason = f"it has none of the receivers ({listed(names)}), but {listed(listed_names)}"
+        return nowhere, None, [f"{file.name} is not used: {reason}"]
     bands = _bands(table, listed_names, names)
     if bands and not any(column_of(table, role, {}) for role in ("x", "y", *GEODETIC.values())):
-        return torch.full((len(names), 3), torch.nan, dtype=torch.float64), bands, notes
+        return nowhere, bands, notes
     position = positions_of(file, table, origin, frame)
     given = np.flatnonzero(~np.isnan(position[:, :2]).all(axis=1))
     position, listed_names = position[given], [listed_names[row] for row in given]

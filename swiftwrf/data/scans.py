@@ -60,6 +60,22 @@ def held_fixes(coordinate: Floats, min_rows: int = 5, min_jump: float = 5.0) -> 
     return repeats
 
 
+def bad_fixes(accuracy: Floats, min_ratio: float = 5.0, max_fraction: float = 0.5) -> tuple[NDArray[np.bool_], float]:
+    """Return which fixes are far less accurate than usual ones by their stated accuracy, and the limit.
+
+    The accuracy is a distance or a dilution of precision (n,), 0 or nan where unknown. A fix above `min_ratio` times the
+    median is left out, unless that are more than `max_fraction` of all (not studied).
+
+    Example:
+        >>> bad_fixes(np.array([4.0, 5.0, 6.0, 90.0]))
+        (array([False, False, False,  True]), 27.5)
+    """
+    known = accuracy[accuracy > 0]
+    limit = min_ratio * float(np.median(known)) if len(known) else np.inf
+    bad = accuracy > limit
+    return (bad, limit) if bad.mean() <= max_fraction else (np.zeros_like(bad), np.inf)
+
+
 def split_packets(rssi: Floats, time: Floats, min_rows: int = 5, min_fraction: float = 0.9) -> list[str]:
     """Return a note on rows of one receiver each that follow each other within a second, or none."""
     alone = float(((~np.isnan(rssi)).sum(axis=1) == 1).mean())

@@ -15,16 +15,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from swiftwrf.data.cells import (
-    parsed,
-    plain_name,
-    text_of,
-)
+from swiftwrf.data.cells import parsed, plain_name, text_of
 from swiftwrf.data.columns import (
+    ACCURACY,
     GEODETIC,
     SNR,
     TRANSMITTED,
+    candidates,
     check_receiver_known,
     column_of,
     column_of_quantity,
@@ -34,32 +33,25 @@ from swiftwrf.data.columns import (
     receiver_columns,
     relay_columns,
 )
-from swiftwrf.data.coordinates import (
-    PlanFrame,
-    floors_of,
-    without_fix,
-)
+from swiftwrf.data.coordinates import PlanFrame, floors_of, without_fix
 from swiftwrf.data.options import TableOptions
 from swiftwrf.data.packets import rows_of_packets, without_relayed
-from swiftwrf.data.places import local_metres, read_coordinates, receivers_of_ends
+from swiftwrf.data.places import floor_column, local_metres, read_coordinates, receivers_of_ends
 from swiftwrf.data.powers import (
+    RSSI_UNITS,
     check_powers,
     end_of_scale,
     find_fillers,
+    in_dbm,
     of_one_power,
     powers_in,
     signal_power,
     without_fillers,
 )
-from swiftwrf.data.radios import (
-    bands_of_receivers,
-    pooled,
-    pools_by,
-    propose_pools,
-)
+from swiftwrf.data.radios import bands_of_receivers, pooled, pools_by, propose_pools
 from swiftwrf.data.ranked import from_ranked_lists
 from swiftwrf.data.receivers import read_receivers
-from swiftwrf.data.scans import held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
+from swiftwrf.data.scans import bad_fixes, held_fixes, list_margin, repeated_scans, split_packets, times_of, windows
 from swiftwrf.data.zones import zone_column
 from swiftwrf.errors import InputError, listed
 
@@ -106,6 +98,7 @@ class _Survey:
         names: Names of the R receivers.
         bands: Their bands, None without a column of these.
         left_out: Columns of other quantities than the received power.
+        accuracy: Column with the stated accuracy of fixes, None without one.
         relays: Columns that count the relays of a packet, none without these.
         corrected: Column of the transmit power that is subtracted, empty without one.
         unused: Columns without use.
@@ -132,6 +125,10 @@ class _Survey:
             asked["rssi"] = column_of_quantity(source, table, options.quantity)
         table, self.n_listed, notes = from_ranked_lists(table, asked)
         self.notes += notes
+        if options.unit in RSSI_UNITS and options.quantity is None:
+            names = [asked["rssi"]] if asked.get("rssi") in table else fnmatch.filter(table, asked.get("rssi", ""))
+            table, notes = in_dbm(source, table, names or candidates(table, "rssi")[:1], options.unit)
+            self.notes += notes
         self.table, self.names, self.end, self.corrected = table, list[str](), dict[str, str](), ""
         self.bands: list[str] | None = None
         if len(options.transmitter) == 1:
@@ -139,6 +136,10 @@ class _Survey:
         elif options.transmitter or not {"x", "y"} & asked.keys():
             self.end = columns_of_end(source, table, options.transmitter)
         self.roles = find_roles(source, table, asked, self.end.values())
+        if "floor" not in self.roles:
+            taken_columns = {name for role, name in self.roles.items() if role != "rssi"} | {*self.end.values()}
+            other = floor_column(source, table, {*taken_columns, *asked.values(), options.offset_by or ""})
+            self.roles |= {} if other is None else {"floor": other}
         if (floor := self.text("floor")) is not None and not floor.any():
             self.notes.append(f"column {self.roles.pop('floor')} is empty, so there are no floors")
         used = {options.offset_by, options.pool_by, *self.end.values()}
@@ -149,9 +150,11 @@ class _Survey:
         if self.names:
             several = f"RSSI of {len(self.names)} receivers = {listed(self.names)}"
             taken.append(several if len(self.names) > 1 else f"RSSI = {self.names[0]}")
-        self.notes += [f"taken as: {', '.join(taken)}", *notes]
+        self.accuracy = next((n for n in self._named(ACCURACY) if not parsed(table[n])[1].any()), None)
+        taken += [f"accuracy of fixes = {self.accuracy}"] * (self.accuracy is not None)
         self.relays = [name for name in relay_columns(table) if name not in (*used, *self.roles.values())]
-        used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays}
+        used |= {*self.roles.values(), *self.names, *self.left_out, *self.relays, self.accuracy}
+        self.notes += [f"taken as: {', '.join(taken)}", *notes]
         self.unused = [name for name in table.columns if name not in used]
 
     def form_rows(self) -> None:
@@ -254,9 +257,20 @@ class _Survey:
                 f"rows that repeat a held fix, before a jump to the next one, are left out: {held.sum()} of {len(row)}"
             )
             row = row[~held]
+        if not keeps_rows:
+            row, of_accuracy = self._accurate(row)
+            notes += of_accuracy
         self.notes += notes
         self.index, self.table_row = row, self.table_row.max(axis=1)[row]
         self.rssi, self.coordinate = self.rssi[row], self.coordinate[row]
+
+    def _accurate(self, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
+        """Return the rows without fixes whose stated accuracy is bad, and a note on these."""
+        if self.accuracy is None:
+            return row, []
+        bad, limit = bad_fixes(parsed(self.table[self.accuracy])[0][self.table_row.max(axis=1)[row]])
+        note = f"fixes with {self.accuracy} above {limit:.3g} are left out: {bad.sum()} of {len(row)} rows"
+        return row[~bad], [note] * bool(bad.any())
 
     def project(self) -> None:
         """Project degrees to local metres, and leave out receivers that never detected the transmitter."""
@@ -319,7 +333,8 @@ class _Survey:
             if moves:
                 raise InputError(f"{self.source} has positions of both ends, which only a model of RSSI takes; {what}")
         elif receivers is not None and receiver_position is None:
-            known, bands, notes = read_receivers(receivers, self.names, self.origin, self.frame)
+            stated = options.receiver_positions is not None
+            known, bands, notes = read_receivers(receivers, self.names, self.origin, self.frame, stated)
             receiver_position, self.bands = known.numpy(), bands or self.bands
             self.notes += notes
         group = self.group.iloc[self.table_row].rename(options.offset_by) if options.offset_by else None
@@ -357,8 +372,8 @@ class _Survey:
         if not self.names:
             raise InputError(
                 f"{self.source} has no column of RSSI in dBm (numbers below 0) besides positions; there are "
-                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', or map "
-                "another quantity: quantity and unit"
+                f"{listed(table.columns)}; choose with columns rssi=NAME or rssi='PREFIX*', map another quantity (quantity "
+                "and unit), or give unit percent or positive"
             )
         if len(self.names) == 1 and "rssi" not in asked and not self.end:
             where = [self.roles[role] for role in ("x", "y", "longitude", "latitude", "time") if role in self.roles]

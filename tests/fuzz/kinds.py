@@ -36,7 +36,7 @@ from small import FLOOR, PUBLISHED, PUBLISHED_RSSI
 from augment import Mixed
 from augment.estimators.baselines import NearestSpectrum
 from augment.estimators.kernel_regression import KernelRegression
-from fuzz import runs
+from fuzz import containers, runs
 from fuzz.commands import config_file
 from fuzz.misuse import CALLS, misuse
 from swiftwrf import (
@@ -294,4 +294,5 @@ ATTEMPTS: dict[str, Attempt] = {
     **{f"followed file {name}": functools.partial(runs.followed_file, name) for name in ("rows.csv", "rows.ndjson")},
     **{f"misuse of {name}": functools.partial(misuse, calls) for name, calls in CALLS.items()},
     "file of options": config_file,
+    **containers.ATTEMPTS,
 }

@@ -49,11 +49,60 @@ def other_readings(data: Snapshots, away: Tensor) -> Iterator[tuple[str, float, 
     if min(abs(math.log(scale)), abs(math.log(scale / 2))) > MIN_SCALE:
         carrier = f"the carrier is about {scaled[scale].array.frequency_hz / 1e9:.2g} GHz"
         yield f"{carrier}, or elements are {scale:.2f} times as far apart", 1, scaled[scale]
+    if (degrees := phases_in_degrees(channel)) is not None:
+        remedy = "take np.deg2rad of them before exp(1j * phase)"
+        yield f"phases in degrees were taken as radians: {remedy}", 0, replace(data, channel=degrees)
     order = best_order(data, away)
     if moved := (order != torch.arange(len(order))).nonzero()[:, 0].tolist():
         names = " and ".join(map(str, moved)) if len(moved) == 2 else listed(moved)
         remedy = f"are exchanged, counted from 0: give csi[..., {order.tolist()}]"
         yield f"elements {names} {remedy}", len(moved) / 2, replace(data, channel=channel[..., order])
+
+
+def phases_in_degrees(channel: Tensor, max_error: float = 3e-4) -> Tensor | None:
+    """Return channels (n, S, K) whose phases were degrees that were taken as radians. None if they were not.
+
+    Degrees were rounded, to 0.01 or more, so that their number of turns follows. At most a tenth of the values are further
+    than `max_error` steps from such a number (not studied).
+
+    Example:
+        >>> degrees = torch.arange(-180.0, 180.0, 7.0, dtype=torch.float64)[:, None, None]
+        >>> channel = torch.polar(torch.ones_like(degrees), degrees)
+        >>> bool(torch.allclose(phases_in_degrees(channel).angle().rad2deg(), degrees, atol=1e-3))
+        True
+    """
+    sample = channel[channel.abs() > 0][:2000].to(torch.complex128).angle()
+    turns = math.tau * torch.arange(-29, 59)  # of -180 to 360 degrees
+    for step in (1.0, 0.5, 0.1, 0.05, 0.01):
+        steps = (sample[:, None] + turns) / step
+        if float(((steps - steps.round()).abs().amin(dim=1) < max_error).double().mean()) < 0.9:
+            continue
+        phase = channel.to(torch.complex128).angle()
+        steps = (phase[..., None] + turns) / step
+        degrees = (phase + turns[(steps - steps.round()).abs().argmin(dim=-1)]).round(decimals=2)
+        if float(degrees.abs().median()) > 10:  # small numbers of radians may be round, too
+            return torch.polar(channel.abs(), degrees.deg2rad().to(channel.abs().dtype))
+    return None
+
+
+def in_fft_order(data: Snapshots, min_step: float = 0.3, min_count: int = 8) -> bool:
+    """Return True if subcarriers look to be in the order of an FFT, from zero frequency, although the carriers ascend.
+
+    In this order the phase steps in the middle, from the highest to the lowest frequency, and the last subcarrier continues
+    with the first. The step is at least `min_step` [rad], that of other neighbours at most a third of it (not studied).
+    """
+    carriers, count = data.frequency_hz, data.channel.shape[1]
+    if carriers is None or count < min_count or bool((carriers.diff() <= 0).any()):
+        return False
+    channel = unit(data.channel)
+    product = (channel.roll(-1, 1) * channel.conj()).mean(
+        dim=(0, 2)
+    )  # from each subcarrier to the next, the last to the first
+    usual = product[: count // 4].mean()
+    step = (product * usual.conj()).angle().abs()
+    middle = step[count // 2 - 2 : count // 2 + 2].max()
+    others = step[: count // 4].max()
+    return float(middle) >= min_step and float(max(others, step[-1] / 2)) <= float(middle) / 3
 
 
 def _element_orders(array: PlanarArray) -> dict[str, Tensor]:

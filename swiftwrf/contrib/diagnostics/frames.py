@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
 from torch import Tensor
 from torch.nn import functional
 
@@ -51,6 +52,7 @@ MIN_EXPLAINED = 0.5  # agreement of an error
 # fraction of the power in the best directions that an error must explain: without and with fitted parameters, and a carrier,
 # whose scale stretched positions share in part
 MIN_REACHED, MIN_REACHED_FITTED, MIN_REACHED_CARRIER = 0.8, 0.9, 0.97
+MAX_DECLARED, MIN_EVIDENCE_IN_PART = 0.1, 0.25  # of the declared frame, and of an error above chance, that fits in part
 REACH_GRID = AngularGrid.hemisphere(30, 120)
 MAX_ELSEWHERE = 0.3  # of the positions, whose peak is elsewhere, in one frame
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -164,7 +166,7 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> tuple[
     frame = _Frame(spectra.position[rows], spectra.fixed_position, spectra.rotation, sign, spectra.array)
     peak, direction = frame.peaks(spectra.store[rows], spectra.grid), frame.direction()
     agreement, chance = _agreement(direction, peak)
-    explanations, turn_deg = _explanations(spectra, rows, frame, peak, snapshots)
+    explanations, turn_deg, in_part = _explanations(spectra, rows, frame, peak, snapshots)
     angle_deg, limit_deg = _nearest(direction, peak).rad2deg(), 10.0
     if spectra.array is not None:  # up to which this array's peaks are in one frame with the lines of sight
         pixel = math.degrees(max(spectra.grid.elevation_step, spectra.grid.azimuth_step))
@@ -173,13 +175,20 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> tuple[
     span_deg, peak_span_deg = _span_deg(direction), _span_deg(peak[:, 0])
     follows = agreement - chance >= MIN_EVIDENCE and not explanations and turn_deg is None
     fits = follows and median_deg <= limit_deg and elsewhere <= MAX_ELSEWHERE
+    error_m = None if explanations or turn_deg is not None else _error_of_positions(frame, angle_deg)
     result: Frame
-    if not fits and (filled := _normalised(spectra.position)):
+    if follows and error_m is not None:
+        result = "explained"
+        text = (
+            f". They follow it, but errors grow towards the array, as of positions that are wrong by about {error_m:.1g} m: "
+            "those of another point of a robot or person than its antenna"
+        )
+    elif not fits and (filled := _normalised(spectra.position)):
         result = "explained"
         text = f". All coordinates fill {filled} exactly, so positions look normalised; give metres"
     elif explanations:
         result = "explained"
-        text = f". That would fit if {'; or if '.join(explanations)}"
+        text = f". That would fit {'in part ' if in_part else ''}if {'; or if '.join(explanations)}"
     elif turn_deg:
         angle = math.hypot(*turn_deg)
         axis = ", ".join(f"{a / angle:.2f}" for a in turn_deg)
@@ -228,12 +237,29 @@ def check_frames(spectra: Spectra, snapshots: Snapshots | None = None) -> tuple[
     return result, f"Peaks are {median_deg:.1f} degrees beside the line of sight (median{by}){text}.", numbers
 
 
+def _error_of_positions(
+    frame: _Frame, angle_deg: Tensor, min_correlation: float = 0.3, min_error_deg: float = 3.0
+) -> float | None:
+    """Return the error of positions [m] that angles (n,) between peaks and lines of sight suggest, None without one.
+
+    An error of positions subtends an angle that falls with the distance. Other errors do not. The bounds are not studied.
+    """
+    distance = frame.away().norm(dim=1)
+    near = frame.array is not None and float(distance.min()) < frame.array.far_field_m
+    if near or float(angle_deg.median()) < min_error_deg:
+        return None
+    correlation = spearmanr(angle_deg.numpy(), -distance.numpy()).statistic
+    is_clear = correlation >= max(min_correlation, 3 / math.sqrt(len(distance)))
+    return float((angle_deg.deg2rad() * distance).median()) if is_clear else None
+
+
 def _explanations(
     spectra: Spectra, rows: Tensor, frame: _Frame, peak: Tensor, snapshots: Snapshots | None
-) -> tuple[list[str], tuple[float, ...] | None]:
+) -> tuple[list[str], tuple[float, ...] | None, bool]:
     """Return errors with clearly more evidence than the declared frame at some rows, in words, and a constant rotation.
 
-    Several errors are not distinguished. The rotation is a rotation vector in array coordinates [deg].
+    Several errors are not distinguished. The rotation is a rotation vector in array coordinates [deg]. The errors explain
+    the spectra in part if the declared frame has no evidence, and they have half of what the array can reach.
     """
     seen = None if snapshots is None else snapshots.subset(rows)
     declared = float(_evidence(frame.away(), frame, peak, seen).mean())
@@ -243,11 +269,15 @@ def _explanations(
         tried[name] = max(found, tried.get(name, found), key=lambda each: each.score)
     best, names = best_explanations({name: each.score for name, each in tried.items()}, TIE)
     if best - declared < (MIN_EVIDENCE if seen is None else MIN_POWER):
-        return [], None
-    explained = [name for name in names if name != UNCALIBRATED and _reaches(tried[name], seen)]
+        return [], None, False
+    names = [name for name in names if name != UNCALIBRATED]
+    explained = [name for name in names if _reaches(tried[name], seen)]
+    in_part = not explained and seen is not None and declared < MAX_DECLARED
+    if in_part:
+        explained = [name for name in names if _reaches_half(tried[name])]
     turn = next((tried[name].turn for name in explained if tried[name].turn is not None), None)
     in_words = [name for name in explained if tried[name].turn is None]
-    return in_words, None if turn is None else tuple(np.degrees(turn).tolist())
+    return in_words, None if turn is None else tuple(np.degrees(turn).tolist()), in_part
 
 
 def _normalised(position: Tensor) -> str:
@@ -278,12 +308,25 @@ def _reaches(found: _Hypothesis, declared: Snapshots | None) -> bool:
         return False
     if found.seen is None or declared is None:
         return mean >= MIN_EXPLAINED + 0.1 * found.free
-    share = found.seen.array.spectrum(found.seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
     chance = 1 / found.seen.channel.shape[2]
     least = MIN_REACHED_FITTED if found.free else MIN_REACHED
     if found.free and found.seen.array.wavelength != declared.array.wavelength:
         least = MIN_REACHED_CARRIER
-    return mean >= max(0.45 + chance, least * float(elements.excess(share, chance).mean()))
+    return mean >= max(0.45 + chance, least * _reach(found.seen))
+
+
+def _reaches_half(found: _Hypothesis) -> bool:
+    """Return True if a hypothesis without fits, but a rotation, explains half of what the array can reach."""
+    is_clear = float(found.evidence.mean()) - found.chance >= MIN_EVIDENCE_IN_PART
+    if found.seen is None or not is_clear or (found.free and found.turn is None):
+        return False
+    return float(found.evidence.mean()) >= _reach(found.seen) / 2
+
+
+def _reach(seen: Snapshots) -> float:
+    """Return the mean evidence of snapshots in the best direction of each."""
+    share = seen.array.spectrum(seen.channel, REACH_GRID, PHASE).square().amax(dim=(1, 2))
+    return float(elements.excess(share, 1 / seen.channel.shape[2]).mean())
 
 
 def _hypotheses(

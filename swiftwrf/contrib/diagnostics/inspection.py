@@ -12,7 +12,7 @@ from torch import Tensor
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.contrib.diagnostics.calibration import calibrate
-from swiftwrf.contrib.diagnostics.elements import in_noise, noisy_elements
+from swiftwrf.contrib.diagnostics.elements import in_fft_order, in_noise, noisy_elements
 from swiftwrf.contrib.diagnostics.frames import Frame, check_frames
 from swiftwrf.contrib.diagnostics.path_loss import check_path_loss
 from swiftwrf.data import Rssi, Snapshots, Spectra
@@ -27,6 +27,7 @@ Level = Literal["fact", "warning"]
 SMOOTH, ROUGH = 0.25, 0.5  # wavelengths between neighbours: below, fields are smooth; above, fringes are lost
 SPARSE = 2.0  # wavelengths between neighbours, beyond which a search for a room finds few of its planes or none
 MAX_EXTENT_M = 1000.0  # beyond, coordinates may be millimetres or pixels
+MIN_GRID_M = 1e5  # of eastings and northings in UTM and national grids, which are metres
 MIN_GAIN = 0.1  # of a recommended calibration, in the fraction of the power along the line of sight
 MIN_BEHIND = 0.01  # share of the lines of sight behind the array that is reported
 MAX_LEVEL_DBM = 10.0  # at 1 m, which no usual transmitter reaches
@@ -106,15 +107,21 @@ def inspect(
     return findings
 
 
-def _check_positions(position: Tensor, findings: Findings, wavelength: float | None = None) -> None:
-    """Report extent and density of positions (n, 3) [m], in wavelengths [m] if the carrier is known."""
+def _check_positions(
+    position: Tensor, findings: Findings, wavelength: float | None = None, projected: bool = False
+) -> None:
+    """Report extent and density of positions (n, 3) [m], in wavelengths [m] if the carrier is known.
+
+    Metres of projected degrees are not asked about.
+    """
     low, high = position.amin(dim=0), position.amax(dim=0)
     extent = (high - low).tolist()
     ranges = ", ".join(
         f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
     )
     findings.add(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
-    if max(extent) > MAX_EXTENT_M:
+    projected = projected or bool((position[:, :2].abs().amin(dim=0) > MIN_GRID_M).all())
+    if max(extent) > MAX_EXTENT_M and not projected:
         findings.warn(f"Positions extend over {max(extent):.0f} m; are they metres?")
     flat = [axis for axis, size in zip("xyz", extent, strict=True) if size < 1e-9]
     if {"x", "y"} & set(flat):
@@ -191,6 +198,11 @@ def _check_snapshots(data: Snapshots, findings: Findings) -> None:
         findings.warn(
             "Elements are more than half a wavelength apart, so spectra have several peaks for one direction."
         )
+    if in_fft_order(data):
+        findings.warn(
+            "Subcarriers look to be in the order of an FFT, from zero frequency, but the carriers ascend: give "
+            "np.fft.fftshift(csi, axes=1). Directions are right, but delays and geometry are not."
+        )
     near = float((data.away.norm(dim=1) < data.array.far_field_m).double().mean())
     if near > 0:
         findings.add(
@@ -252,7 +264,7 @@ def _check_rssi(data: Rssi, findings: Findings) -> None:
         receivers=len(data.receiver_names),
         detected_fraction=share,
     )
-    _check_positions(data.transmitter_position, findings)
+    _check_positions(data.transmitter_position, findings, projected=data.origin is not None)
     count = detected.sum(dim=0)
     few = [name for name, n in zip(data.receiver_names, count.tolist(), strict=True) if n < MIN_TRAINING]
     if few:

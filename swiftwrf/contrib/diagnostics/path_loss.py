@@ -8,9 +8,11 @@ cannot show are not tried, e.g. swaps with an axis along which all positions are
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from swiftwrf.contrib.diagnostics.frames import best_delay, best_explanations, best_mirror, linear_errors
@@ -69,6 +71,8 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     for axis in varying:
         meaning, mirrored = best_mirror(place, located, axis, lambda p: _explained(p, data), refined=True)
         fitted[meaning] = _explained(mirrored, data)
+    meaning, scaled = best_scale(place, lambda p: _explained(p, data))
+    fitted[meaning] = _explained(scaled, data)
     if len(walk) >= 5:  # a delay is at most a fifth of the rows
         meaning, moved = best_delay(walk.transmitter_position, walk.time, lambda p: _explained(p[rows], data))
         fitted[meaning] = _explained(moved[rows], data)
@@ -80,6 +84,18 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if best >= max(MIN_EXPLAINED, 0.9 * attainable) and best - declared >= 0.1:
         return replace(report, explanation="; or if ".join(names))
     return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
+
+
+def best_scale(position: Tensor, score: Callable[[Tensor], float]) -> tuple[str, Tensor]:
+    """Return in words, and the positions (n, 3) in, the scale of x and y with the highest score, e.g. pixels in a metre."""
+
+    def scaled(exponent: float) -> Tensor:
+        return position / torch.tensor([10.0**exponent, 10.0**exponent, 1.0], dtype=position.dtype)
+
+    best = max(torch.linspace(-3, 3, 121).tolist(), key=lambda exponent: score(scaled(exponent)))
+    near = best - 0.05, best + 0.05
+    best = float(minimize_scalar(lambda e: -score(scaled(float(e))), bounds=near, method="bounded").x)
+    return f"x and y of the positions have {10**best:.3g} units in a metre (--scale {10**best:.3g})", scaled(best)
 
 
 def _explained(position: Tensor, data: Rssi) -> float:

@@ -29,8 +29,9 @@ from swiftwrf.data.archives import MAX_UNPACKED_BYTES, refusing_broken
 from swiftwrf.data.cells import column_of_numbers, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.files import read_bytes, read_table, read_yaml
+from swiftwrf.data.formats.array_description import array_of, described_arrays
 from swiftwrf.data.formats.base import Format, ReadOptions
-from swiftwrf.data.formats.snapshots import array_of, described_arrays, snapshots_of
+from swiftwrf.data.formats.snapshots import snapshots_of
 from swiftwrf.data.snapshots import Snapshots
 from swiftwrf.errors import InputError, listed, optional_module, ranges
 

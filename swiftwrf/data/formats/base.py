@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from swiftwrf.array.angles import AngularGrid
 from swiftwrf.array.beamforming import PHASE
 from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.archives import ARCHIVES, array_names
 from swiftwrf.data.options import TableOptions
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.snapshots import Snapshots
@@ -160,7 +161,9 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     try:
         matches = _readers(source, options, *registries)
         if not matches:
-            raise InputError(f"{source} is in none of the known formats ({known}); docs/formats.md describes them")
+            raise InputError(
+                f"{source} is in none of the known formats ({known}); docs/formats.md describes them{_held(source)}"
+            )
         if len(matches) > 1:
             names = " and ".join(name for name, _ in matches)
             raise InputError(
@@ -177,6 +180,16 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
         raise InputError(f"{error.filename or source} cannot be read ({reason})") from None
     array = getattr(data, "array", None)
     return data if array is None or array.axis is None else replace(data, notes=(*data.notes, LINEAR_ARRAY))
+
+
+def _held(source: Path) -> str:
+    """Return in words what the only archive of arrays of a source holds, and what to do; empty without one."""
+    files = [source] if source.is_file() else list(source.iterdir())
+    archives = [file for file in files if file.suffix in ARCHIVES]
+    if len(archives) != 1 or not (names := array_names(archives[0])):
+        return ""
+    held = f"{archives[0].name} holds {listed(sorted(names))}"
+    return f"; {held}: if it has array snapshots, name csi, position, ... with arrays"
 
 
 def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:

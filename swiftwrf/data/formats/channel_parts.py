@@ -29,12 +29,16 @@ def channel_parts(names: Iterable[str]) -> tuple[str, str] | None:
         >>> channel_parts(["position", "csi_abs", "csi_angle_deg"])
         ('csi_abs', 'csi_angle_deg')
     """
-    plain = {re.sub(UNITS, "", re.sub("^(csi|channel|h)_?", "", name.lower())): name for name in sorted(names)}
+    plain = {_plain(name): name for name in sorted(names)}
     for kinds in (POLAR, CARTESIAN):
         found = [[plain[name] for name in kind if name in plain] for kind in kinds]
         if all(len(own) == 1 for own in found):
             return found[0][0], found[1][0]
     return None
+
+
+def _plain(name: str) -> str:
+    return re.sub(UNITS, "", re.sub("^(csi|channel|h)_?", "", name.lower()))
 
 
 def joined(file: Path, first: tuple[str, NDArray[Any]], second: tuple[str, NDArray[Any]]) -> NDArray[np.complex128]:
@@ -52,7 +56,7 @@ def joined(file: Path, first: tuple[str, NDArray[Any]], second: tuple[str, NDArr
     (name, value), (other, angle) = first, second
     if value.shape != angle.shape:
         raise InputError(f"{file}: {name} and {other} have different shapes, {value.shape} and {angle.shape}")
-    if any(name.lower().removeprefix("csi_") == kind for kind in CARTESIAN[0]):
+    if _plain(name) in CARTESIAN[0]:
         return value + 1j * angle
     unit = re.search(UNITS, other.lower())
     if unit is None and (most := float(np.nanmax(np.abs(angle), initial=0.0))) > 2 * math.pi + 1e-3:

@@ -45,8 +45,8 @@ from swiftwrf.data.cells import column_of_numbers, seconds, text_of
 from swiftwrf.data.columns import column_of
 from swiftwrf.data.coordinates import Floors, GeodeticOrigin, PlanFrame, without_fix
 from swiftwrf.data.files import digests, number, numbers, read_bytes, read_table, read_xyz, read_yaml, sha256
+from swiftwrf.data.formats.array_description import array_of, described_arrays, pose_of
 from swiftwrf.data.formats.base import Format, ReadOptions
-from swiftwrf.data.formats.snapshots import array_of, described_arrays, pose_of
 from swiftwrf.data.powers import NOT_DETECTED_DBM, find_fillers, without_fillers
 from swiftwrf.data.receivers import read_receivers
 from swiftwrf.data.rssi import META, SURVEY, Offsets, Rssi

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from swiftwrf.array.angles import ArrayPose
-from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
-from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays, refusing_broken
-from swiftwrf.data.files import check_carrier, digests, read_yaml
+from swiftwrf.array.planar import PlanarArray
+from swiftwrf.data.archives import ARCHIVES, Arrays, array_names, read_arrays
+from swiftwrf.data.files import digests
+from swiftwrf.data.formats.array_description import POSE, array_of, pose_of
+from swiftwrf.data.formats.array_stations import described_stations, of_station, stations_of_arrays
 from swiftwrf.data.formats.base import Format, ReadOptions, station
 from swiftwrf.data.formats.channel_parts import PAIRS, channel_parts, joined, paired
 from swiftwrf.data.snapshots import Snapshots
@@ -23,10 +24,8 @@ from swiftwrf.errors import InputError, listed, ranges
 from swiftwrf.positions import check_positions, to_tensor
 
 REQUIRED_ARRAYS = ("csi", "position", "frequency_hz", "array_position")
-POSE = ("array_orientation", "array_normal", "array_up")  # the first, or the others
 OPTIONAL = (*POSE, "element_position", "rows", "columns", "spacing_m", "line_of_sight", "time")
 SCALARS = ("frequency_hz", "rows", "columns", "spacing_m")
-STATIONS = "stations.yml"  # descriptions of several arrays, whose number is the second axis of csi
 PER_ROW = ("csi", "position", "line_of_sight", "time")
 VECTORS = ("array_position", *POSE, "line_of_sight", "time", "frequency_hz")
 
@@ -41,7 +40,8 @@ class SnapshotArrays(Format[Snapshots]):
 
     def stations(self, path: Path) -> list[str]:
         file = _file(path) or path
-        described = _described_stations(file) or _stations_of_arrays(file, {})
+        if (described := described_stations(file)) is None and {"position", "array_position"} <= array_names(file):
+            described = stations_of_arrays(file, read_arrays(file, ["position", "array_position"], POSE))
         return [] if described is None else [name for name, _ in described[1]]
 
     def read(self, path: Path, options: ReadOptions) -> Snapshots:
@@ -49,10 +49,8 @@ class SnapshotArrays(Format[Snapshots]):
         name = {array: stated.get(array, array) for array in (*REQUIRED_ARRAYS, *OPTIONAL)}
         if file.is_dir() or stated.keys() - name.keys():
             raise InputError(f"arrays takes {', '.join(name)} of a file that is named, got {listed(stated)} of {file}")
-        described = _described_stations(file) or _stations_of_arrays(file, stated)
-        if described is None and options.station is not None:
-            raise InputError(f"{file} holds one array; leave station out")
-        required = ("csi", "position") if described is not None and described[0] != file else REQUIRED_ARRAYS
+        described = described_stations(file)
+        required = ("csi", "position") if described is not None else REQUIRED_ARRAYS
         names = array_names(file)
         halves = None if name["csi"] in names else channel_parts(names)
         needed = [name[array] for array in dict.fromkeys((*required, *stated)) if array != "csi" or halves is None]
@@ -63,12 +61,15 @@ class SnapshotArrays(Format[Snapshots]):
             first, second = ((half, stored[half]) for half in halves)
             stored[name["csi"]] = joined(file, first, second)
         arrays = {array: stored[name_in_file] for array, name_in_file in name.items() if name_in_file in stored}
+        described = described or stations_of_arrays(file, arrays)
+        if described is None and options.station is not None:
+            raise InputError(f"{file} holds one array; leave station out")
         label = file.stem if file.stem != "snapshots" else None
         if described is None:
             return snapshots_of(file, arrays, options, [file], label)
         beside, parts = described
         number = station(f"{beside} describes {len(parts)} arrays", [part for part, _ in parts], options.station)
-        own, received = _of_station(file, arrays | parts[number][1], number, len(parts))
+        own, received = of_station(file, arrays | parts[number][1], number, len(parts))
         rows = received[:: options.every or 1]
         own = {array: values[rows] if array in PER_ROW else values for array, values in own.items()}
         return snapshots_of(file, own, options, [*dict.fromkeys((file, beside))], label, index=rows.tolist())
@@ -147,61 +148,11 @@ def snapshots_of(
     return data if step == 1 else data.subset(torch.arange(0, n, step))
 
 
-def _described_stations(file: Path) -> tuple[Path, list[tuple[str, Arrays]]] | None:
-    """Return the file stations.yml beside the arrays that lists several stations, and name and description of each.
-
-    Raises:
-        InputError: A file that is no list of stations with names.
-    """
-    beside = file.parent / STATIONS
-    content = read_yaml(beside) if file.is_file() and beside.is_file() else {}
-    if not content:
-        return None
-    each_station = content.get("stations")
-    if not isinstance(each_station, list) or not all(isinstance(x, dict) and "name" in x for x in each_station):
-        raise InputError(f"{beside} must have stations, a list of arrays, each with its name, got {each_station!r}")
-    common = {name: value for name, value in content.items() if name != "stations"}
-    return beside, [(str(each["name"]), described_arrays(beside, common | each)) for each in each_station]
-
-
-def _stations_of_arrays(file: Path, stated: Mapping[str, str]) -> tuple[Path, list[tuple[str, Arrays]]] | None:
-    """Return the file itself, and name and description of each of several arrays whose poses are rows of arrays in it."""
-    position, at, *turned = (stated.get(array, array) for array in ("position", "array_position", *POSE))
-    if not {position, at} <= array_names(file):
-        return None
-    stored = read_arrays(file, [position, at], turned)
-    count = len(stored[at])
-    if stored[at].ndim != 2 or stored[at].shape[1] != 3 or count in (1, len(stored[position])):
-        return None  # one array, or one that moves
-    poses = {array: stored[name] for array in ("array_position", *POSE) if (name := stated.get(array, array)) in stored}
-    several = {array: values for array, values in poses.items() if values.ndim == 2 and len(values) == count}
-    return file, [(f"array{n + 1}", {array: values[n] for array, values in several.items()}) for n in range(count)]
-
-
-def _of_station(file: Path, arrays: Arrays, number: int, count: int) -> tuple[Arrays, NDArray[np.int64]]:
-    """Return the arrays of one station, and the numbers of the rows that it received.
-
-    Raises:
-        InputError: csi without an axis of the stations, or nothing received.
-    """
-    csi = arrays["csi"]
-    if csi.ndim not in (3, 4) or csi.shape[1] != count:
-        raise InputError(
-            f"{file}: csi must have shape (n, {count}, [subcarriers or packets,] elements) for its {count} arrays, got "
-            f"{csi.shape}"
-        )
-    own = csi[:, number]
-    received = (np.nan_to_num(own) != 0).reshape(len(own), -1).any(axis=1)
-    if not received.any():
-        raise InputError(f"{file}: array {number + 1} received nothing; leave it out")
-    return arrays | {"csi": own}, received.nonzero()[0]
-
-
 def _file(path: Path) -> Path | None:
     if path.is_dir():
-        return next(
-            (path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()), None
-        )
+        usual = [path / f"snapshots{suffix}" for suffix in ARCHIVES if (path / f"snapshots{suffix}").is_file()]
+        others = [file for file in path.iterdir() if file.suffix in ARCHIVES and file.is_file()]
+        return usual[0] if usual else _file(others[0]) if len(others) == 1 else None
     names = array_names(path) if path.suffix in ARCHIVES else set()
     return path if "csi" in names or channel_parts(names) else None
 
@@ -271,12 +222,32 @@ def _channel(file: Path, csi: NDArray[np.generic], n: int, elements: int) -> Ten
             f"{file}: csi has shape {csi.shape} with its {elements} elements in the middle; they must be the last axis, so "
             "give csi.transpose(0, 2, 1), in MATLAB permute(csi, [1 3 2])"
         )
+    if (remedy := _as_one_axis(csi.shape, elements)) and csi.shape[0] == n:
+        raise InputError(
+            f"{file}: csi has shape {csi.shape}, but needs its {elements} elements on one axis, the last; {remedy}"
+        )
     if csi.ndim not in (2, 3) or csi.shape[0] != n or csi.shape[-1] != elements or 0 in csi.shape:
         raise InputError(
             f"{file}: csi must have shape ({n}, [subcarriers or packets,] {elements}) for {n} positions and {elements} "
             f"elements, got {csi.shape}"
         )
     return torch.from_numpy(csi.reshape(n, -1, elements).astype(np.complex128))
+
+
+def _as_one_axis(shape: tuple[int, ...], elements: int) -> str:
+    """Return how to bring elements on two neighbouring axes to the last one, in words. Empty without such axes.
+
+    Example:
+        >>> _as_one_axis((140, 4, 4, 57), 16)
+        'axes 1 and 2 hold 4 x 4 of them: give csi.reshape(140, 16, 57).transpose(0, 2, 1)'
+    """
+    for first in range(1, len(shape) - 1):
+        if shape[first] * shape[first + 1] == elements and min(shape[first : first + 2]) > 1 and len(shape) <= 4:
+            joined = (*shape[:first], elements, *shape[first + 2 :])
+            moved = ".transpose(0, 2, 1)" if first == 1 and len(shape) == 4 else ""
+            axes = f"axes {first} and {first + 1} hold {shape[first]} x {shape[first + 1]} of them"
+            return f"{axes}: give csi.reshape{joined}{moved}"
+    return ""
 
 
 def measured(
@@ -348,84 +319,3 @@ def _scaled(file: Path, channel: Tensor) -> Tensor:
     if len(beyond):
         raise InputError(f"{file}: csi of row {int(beyond[0])} has no power, or more than numbers hold; leave it out")
     return (channel / power.sqrt()).to(torch.complex64)
-
-
-def described_arrays(file: Path, content: Mapping[str, Any]) -> Arrays:
-    """Return the arrays of snapshots.npz that describe the array of antennas, from the texts of a YAML mapping."""
-    arrays = {}
-    for name in ("frequency_hz", "array_position", *POSE, "rows", "columns", "spacing_m", "element_position"):
-        if name in content:
-            with refusing_broken(f"{name} of {file}", "a number or lists of numbers of one length"):
-                arrays[name] = np.array(content[name], dtype=np.float64)
-    return arrays
-
-
-def pose_of(file: Path, arrays: Arrays) -> ArrayPose:
-    """Return the pose of the array, by its orientation or by its normal and upper side."""
-    stated = next((name for name in POSE[:2] if name in arrays), None)
-    if stated is None:
-        raise InputError(f"{file} lacks array_orientation; give that unit quaternion, or array_normal and array_up")
-    position, orientation = arrays["array_position"], arrays[stated]
-    if position.ndim == 2 or orientation.ndim == 2:
-        raise InputError(
-            f"{file}: array_position and array_orientation have shapes {position.shape} and {orientation.shape}, as of an "
-            "array that moves; the array must rest while the transmitter moves, so give its one position (3) and "
-            "quaternion (4)"
-        )
-    if stated == "array_orientation" and orientation.shape == (3,):
-        raise InputError(
-            f"{file}: array_orientation has 3 numbers; Euler angles leave their order open, so give the unit quaternion "
-            "(x, y, z, w) that turns array into world coordinates"
-        )
-    with refusing_broken(file, "the description of an array"):
-        where, turned = (tuple(values.flatten().tolist()) for values in (position, orientation))
-        if stated == "array_orientation":
-            return ArrayPose(where, turned)
-        return ArrayPose.facing(where, turned, tuple(arrays.get("array_up", np.eye(3)[2]).flatten().tolist()))
-
-
-def array_of(file: Path, arrays: Arrays, spacing_wavelengths: tuple[float, float] = (0.01, 20.0)) -> PlanarArray:
-    """Return the array, described by the positions of its elements or by rows, columns and spacing.
-
-    Neighbouring elements that are closer or farther apart than the given spacings have another unit.
-    """
-    frequency = arrays["frequency_hz"]
-    if frequency.shape != ():
-        raise InputError(f"{file}: frequency_hz must be one number, the carrier, got shape {frequency.shape}")
-    check_carrier(file, float(frequency))
-    wavelength = LIGHT_SPEED / float(frequency)
-    if "element_position" in arrays:
-        array = PlanarArray(_plane(file, arrays, wavelength), wavelength)
-    elif all(name in arrays and arrays[name].shape == () for name in ("rows", "columns", "spacing_m")):
-        rows, columns, spacing = (float(arrays[name]) for name in ("rows", "columns", "spacing_m"))
-        if not (rows.is_integer() and columns.is_integer() and min(rows, columns) >= 1 and rows * columns < 1e6):
-            raise InputError(f"{file}: rows and columns must be whole numbers from 1, got {rows:g} and {columns:g}")
-        array = PlanarArray.grid(int(rows), int(columns), spacing, float(frequency))
-    else:
-        raise InputError(
-            f"{file} lacks the array: give element_position (elements, 3) in metres, or the numbers rows, columns and "
-            "spacing_m"
-        )
-    if len(array.element) < 2:
-        raise InputError(
-            f"{file} describes an array of one element, which resolves no directions; at least 2 are needed"
-        )
-    apart, (low, high) = array.spacing_wavelengths, spacing_wavelengths
-    if not low <= apart <= high:
-        raise InputError(
-            f"{file}: neighbouring elements are {apart * array.wavelength:.4g} m, {apart:.3g} wavelengths apart; expected "
-            f"{low:g} to {high:g} wavelengths, so is the spacing in metres and the carrier in Hz?"
-        )
-    return array
-
-
-def _plane(file: Path, arrays: Arrays, wavelength: float) -> Tensor:
-    """Return the positions of the elements in their plane, (K, 2) [m]."""
-    columns = 2 if arrays["element_position"].shape[1:] == (2,) else 3
-    element = check_positions(arrays["element_position"], f"{file}: element_position", (None, columns))
-    if columns == 3 and float((height := element[:, 2]).max() - height.min()) > 1e-3 * wavelength:
-        raise InputError(
-            f"{file}: element_position spreads {float(height.max() - height.min()):.3g} m along z; give the elements in "
-            "array coordinates, x and y in the array's plane, and let array_orientation turn them into the world"
-        )
-    return element[:, :2]

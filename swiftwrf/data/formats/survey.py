@@ -1,6 +1,7 @@
 """Reader of survey tables: positions and RSSI, one column a receiver (wide) or one row a packet (long).
 
-Tables are CSV, maybe compressed, or Parquet, the records in JSON, GPX and KML documents, or logs in databases.
+Tables are CSV, maybe compressed or in a workbook, or Parquet, the records in JSON, GPX and KML documents, or logs in
+databases.
 """
 
 from __future__ import annotations
@@ -11,9 +12,8 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from swiftwrf.data.archives import PACKED
 from swiftwrf.data.columns import is_coordinate, is_rssi
-from swiftwrf.data.files import BINARIES, SUFFIXES, TABLES, digests, has_header, read_table
+from swiftwrf.data.files import BINARIES, SUFFIXES, TABLES, TEXTS, digests, has_header, read_table
 from swiftwrf.data.formats.base import SNAPSHOT_FORMATS, Format, ReadOptions
 from swiftwrf.data.formats.nerf2 import FILES as NERF2_FILES
 from swiftwrf.data.logs import is_log_of_scans, is_track, joined_by_time
@@ -39,15 +39,16 @@ class SurveyTable(Format[Rssi]):
 
     def read(self, path: Path, options: ReadOptions) -> Rssi:
         file, others, table = _table(path)
-        receivers = file.with_name(RECEIVERS)
-        stated = receivers if receivers.is_file() else None
+        beside = file.with_name(RECEIVERS)
+        receivers = beside if beside.is_file() else None
+        receivers = receivers if options.receiver_positions is None else Path(options.receiver_positions)
         splits = read_splits(file.parent, len(table), first=0)
-        arguments = read_survey(file, table, options, stated, keeps_rows=bool(splits))
+        arguments = read_survey(file, table, options, receivers, keeps_rows=bool(splits))
         data = Rssi(
             **arguments,
             name=file.stem.removesuffix(".csv"),
             named_splits=kept_splits(splits, torch.from_numpy(arguments["index"]), len(table)),
-            source=digests([file, *others, *([stated] if stated else [])], file.parent),
+            source=digests([file, *others, *([receivers] if receivers else [])], file.parent),
         )
         if data.receiver_moves and bool(data.receiver_position.isnan().any()):
             raise InputError(
@@ -66,7 +67,7 @@ def _tables(path: Path) -> list[Path]:
         return []
     files = sorted(file for file in path.iterdir() if file.is_file() and file.name != RECEIVERS)
     plain = [file for file in files if file.suffix.lower() in SUFFIXES]
-    return plain or [file for file in files if file.suffix.lower() in (*PACKED, *BINARIES)]
+    return plain or [file for file in files if file.suffix.lower() in (*TEXTS, *BINARIES)]
 
 
 def _table(path: Path) -> tuple[Path, list[Path], pd.DataFrame]:

@@ -25,11 +25,12 @@ def channel(folder):
         lambda csi: {"amplitude": abs(csi), "phase_deg": np.rad2deg(np.angle(csi))},
         lambda csi: {"magnitude": abs(csi), "phase_rad": np.angle(csi) + 40 * np.pi},
         lambda csi: {"csi_real": csi.real, "csi_imag": csi.imag},
+        lambda csi: {"h_real": csi.real, "h_imag": csi.imag},
         lambda csi: {"I": csi.real, "Q": csi.imag},
         lambda csi: {"csi": np.stack([csi.real, csi.imag], axis=-1)},
         lambda csi: {"csi": np.stack([csi.real, csi.imag], axis=-1).reshape(*csi.shape[:-1], -1)},
     ],
-    ids=["abs, angle", "degrees", "unwrapped", "real, imag", "I, Q", "pairs", "pairs in turn"],
+    ids=["abs, angle", "degrees", "unwrapped", "real, imag", "h", "I, Q", "pairs", "pairs in turn"],
 )
 def test_two_parts_are_one_channel(tmp_path, known, parts):
     plain = channel(write_snapshots(tmp_path / "plain"))
@@ -87,3 +88,27 @@ def test_one_structure_holds_the_arrays(tmp_path, known, compressed):
     (tmp_path / "data").mkdir()
     savemat(tmp_path / "data" / "snapshots.mat", {"dataset": known}, do_compression=compressed)
     np.testing.assert_allclose(channel(tmp_path / "data").numpy(), plain.numpy(), atol=1e-6)
+
+
+def test_an_archive_of_another_name_is_read_and_an_unknown_one_is_described(tmp_path, known):
+    plain = channel(write_snapshots(tmp_path / "plain"))
+    folder = write_snapshots(tmp_path / "other")
+    (folder / "snapshots.npz").rename(folder / "monday.npz")
+    assert channel(folder).equal(plain)
+    unknown = tmp_path / "unknown"
+    unknown.mkdir()
+    np.savez(unknown / "monday.npz", **{"H" if name == "csi" else name: values for name, values in known.items()})
+    for source in (unknown, unknown / "monday.npz"):
+        with pytest.raises(InputError, match=r"holds H, array_orientation, .* with arrays"):
+            swiftwrf.load_snapshots(source)
+
+
+@pytest.mark.parametrize("form", ["(n, S, 4, 4)", "(n, 4, 4, S)", "(n, 4, 4)"])
+def test_elements_on_two_axes_are_refused_with_what_makes_them_one(tmp_path, known, form):
+    csi = known["csi"] if form != "(n, 4, 4)" else known["csi"][:, 0]
+    apart = csi.reshape(*csi.shape[:-1], 4, 4)
+    apart = apart.transpose(0, 2, 3, 1) if form == "(n, 4, 4, S)" else apart
+    with pytest.raises(InputError, match=r"axes . and . hold 4 x 4 of them: give csi.reshape") as refusal:
+        channel(write_snapshots(tmp_path / "apart", csi=apart))
+    mended = eval(str(refusal.value).split("give ")[1], {"csi": apart})
+    np.testing.assert_array_equal(mended, csi)

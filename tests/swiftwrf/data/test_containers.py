@@ -2,6 +2,7 @@
 
 import gzip
 import sqlite3
+import sys
 import zipfile
 
 import numpy as np
@@ -52,7 +53,7 @@ def test_broken(tmp_path, monkeypatch):
         "two.zip": "unpack it and name the one",
         "cut.csv.gz": "not a gzip file",
         "none.zip": "not a zip archive",
-        "book.xlsx": "save the sheet as CSV",
+        "book.xlsx": "is not a workbook|save the sheet as CSV",
         "no.sqlite": "not a SQLite database",
     }
     for name, words in expected.items():
@@ -62,6 +63,29 @@ def test_broken(tmp_path, monkeypatch):
     (tmp_path / "bomb.csv.gz").write_bytes(gzip.compress(PLAIN.encode() + b"5,5,-60,-70\n" * 10_000))
     with pytest.raises(InputError, match="unpacks to more than"):
         swiftwrf.load_rssi(tmp_path / "bomb.csv.gz")
+
+
+def test_a_workbook_has_the_table_of_its_only_sheet_with_values(tmp_path, plain):
+    openpyxl = pytest.importorskip("openpyxl", reason="needs the extra xlsx")
+    book = openpyxl.Workbook()
+    book.create_sheet("notes")
+    for number, line in enumerate(PLAIN.split()):
+        book.active.append([float(cell) if number else cell for cell in line.split(",")])
+    book.save(tmp_path / "walk.xlsx")
+    read = swiftwrf.load_rssi(tmp_path / "walk.xlsx")
+    assert read.rssi_dbm.equal(plain.rssi_dbm)
+    assert read.transmitter_position.equal(plain.transmitter_position)
+    book["notes"]["A1"] = "of Monday"
+    book.save(tmp_path / "two.xlsx")
+    with pytest.raises(InputError, match="2 of its sheets have values"):
+        swiftwrf.load_rssi(tmp_path / "two.xlsx")
+
+
+def test_a_workbook_without_openpyxl_is_refused_with_both_remedies(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    (tmp_path / "walk.xlsx").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"save the sheet as CSV.*swiftwrf-tasks\[xlsx\]"):
+        swiftwrf.load_rssi(tmp_path)
 
 
 def rows_of_walk():

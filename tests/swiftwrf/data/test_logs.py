@@ -101,3 +101,30 @@ def test_times_that_run_back():
     )
     np.testing.assert_allclose(reset.time, elapsed - 3100 * (elapsed >= 60))
     assert any(note.endswith("run back by 3098 s before row 31") for note in reset.notes)
+
+
+def test_a_log_of_a_krakensdr_has_rssi_at_positions_and_no_header(tmp_path):
+    spectrum = ", ".join(["0.01"] * 360)
+    rows = [
+        f"{1780000000000 + 1000 * k}, {10 + k}, 3.1, -{40 + k}.5, 433920000, UCA, 120, roof, 48.{k:04d}, 11.5, 10, 0, GPS, "
+        f"R, R, R, R, {spectrum}"
+        for k in range(12)
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    data = load_rssi(tmp_path / "log.csv")
+    assert data.receiver_names == ("roof",)
+    np.testing.assert_array_equal(data.rssi_dbm[:, 0], -40.5 - np.arange(12))
+    degrees = data.origin.to_degrees(data.transmitter_position[:, :2].numpy())
+    np.testing.assert_allclose(degrees[:, 0], 48 + 1e-4 * np.arange(12), atol=1e-8)
+    assert any("KrakenSDR" in note for note in data.notes)
+
+
+@pytest.mark.parametrize("name", ["accuracy", "AccuracyMeters", "hdop", "gps_accuracy_m"])
+def test_fixes_of_bad_accuracy_are_left_out(name):
+    walk = pd.DataFrame({"x": np.arange(40.0), "y": 0.0, "ap": -50.0 - np.arange(40), name: 4.0})
+    walk.loc[[3, 17, 30], name] = [80.0, 21.0, 19.0]
+    data = Rssi.from_frame(walk)
+    assert data.index.tolist() == [row for row in range(40) if row not in (3, 17)]
+    assert f"fixes with {name} above 20 are left out: 2 of 40 rows" in data.notes
+    whole = Rssi.from_frame(walk.assign(**{name: np.linspace(3, 9, 40)}))
+    assert len(whole) == 40

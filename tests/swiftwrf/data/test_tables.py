@@ -837,7 +837,6 @@ REFUSED = [
     ("'a' twice", "x,y,a,a\n1,2,-50,-60", {}),
     ("not a Parquet file", {"walk.parquet": "PAR1"}, {}),
     ("must have each receiver once", beside("receiver,x,y,z\na,1,2,3\na,1,2,3"), {}),
-    ("has none of the receivers", beside("receiver,x,y,z\nelsewhere,1,2,3"), {}),
     ("has no column of times", long_of(WALK, "anchor").drop(columns="t"), {"window": 1.0}),
 ]
 
@@ -852,3 +851,64 @@ def test_positions_without_a_known_header_are_refused_with_all_that_are_known(tm
     (tmp_path / "places.csv").write_text("width,depth\n1,2\n")
     with pytest.raises(InputError, match="no columns of positions, x and y or longitude and latitude; there are width"):
         read_places(tmp_path / "places.csv", None, PlanFrame())
+
+
+def test_positions_of_other_receivers_beside_a_table_are_a_note_and_stated_ones_a_refusal(tmp_path):
+    (tmp_path / "walk.csv").write_text(text(WALK))
+    (tmp_path / "receivers.csv").write_text("receiver,x,y,z\nelsewhere,1,2,3\n")
+    data = load_rssi(tmp_path)
+    assert not data.located
+    assert any("receivers.csv is not used: it has none of the receivers" in note for note in data.notes)
+    with pytest.raises(InputError, match="has none of the receivers"):
+        load_rssi(tmp_path, receiver_positions=tmp_path / "receivers.csv")
+    name = data.receiver_names[0]
+    (tmp_path / "own.csv").write_text(f"receiver,x,y,z\n{name},4,5,6\n")
+    chosen = load_rssi(tmp_path / "walk.csv", receiver_positions=tmp_path / "own.csv")
+    assert chosen.receiver_position[0].tolist() == [4.0, 5.0, 6.0]
+    assert "own.csv" in chosen.source
+
+
+@pytest.mark.parametrize(
+    ("unit", "cells", "dbm"),
+    [("percent", [80, 41, 100], [-60.0, -79.5, -50.0]), ("positive", [61, 79, 88], [-61.0, -79.0, -88.0])],
+)
+@pytest.mark.parametrize("suffix", ["", "%"])
+def test_rssi_in_percent_or_without_sign_is_converted_where_its_unit_is_stated(tmp_path, unit, cells, dbm, suffix):
+    (tmp_path / "long.csv").write_text(
+        "x,y,ap,rssi\n" + "".join(f"{k},{k},a,{v}{suffix}\n" for k, v in enumerate(cells))
+    )
+    (tmp_path / "wide.csv").write_text("x,y,AP1\n" + "".join(f"{k},{k},{v}{suffix}\n" for k, v in enumerate(cells)))
+    assert load_rssi(tmp_path / "long.csv", unit=unit).rssi_dbm[:, 0].tolist() == dbm
+    assert load_rssi(tmp_path / "wide.csv", unit=unit, columns={"rssi": "AP*"}).rssi_dbm[:, 0].tolist() == dbm
+    for name, words in (("long", "give unit positive.* unit percent"), ("wide", "give unit percent or positive")):
+        with pytest.raises(InputError, match=words):
+            load_rssi(tmp_path / f"{name}.csv")
+    with pytest.raises(InputError, match="choose with columns rssi=NAME"):
+        load_rssi(tmp_path / "wide.csv", unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "heights"),
+    [
+        ("Level", [1, 2], {4.0, 8.0}),
+        ("building_level", ["Ground", "Level 2"], {0.0, 8.0}),
+        ("level", ["EG", "1.OG"], {0.0, 4.0}),
+    ],
+)
+def test_levels_with_a_known_order_are_floors(name, values, heights):
+    walk = pd.DataFrame({"x": range(12), "y": 0.0, "ap": -50.0, name: values * 6})
+    data = Rssi.from_frame(walk)
+    assert {*data.transmitter_position[:, 2].tolist()} == heights
+    assert f"floor = {name}" in data.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("Map", ["1", "2"]), ("FloorPlan", ["west", "east"]), ("Level", ["red", "blue"])]
+)
+def test_maps_and_levels_without_order_are_asked_about(name, values):
+    walk = pd.DataFrame({"x": range(12), "y": 0.0, "ap": -50.0, name: values * 6})
+    with pytest.raises(InputError, match=f"is '{name}' .* the floor of each row"):
+        Rssi.from_frame(walk)
+    assert len(Rssi.from_frame(walk, offset_by=name)) == 12
+    one = Rssi.from_frame(walk.assign(**{name: values[0]}))
+    assert len(one) == 12

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from swiftwrf import AngularGrid
+from swiftwrf import AngularGrid, load_snapshots
 from swiftwrf.array.planar import LIGHT_SPEED, PlanarArray
 from swiftwrf.contrib.diagnostics.inspection import inspect
 from swiftwrf.data import Snapshots
@@ -144,6 +144,25 @@ def sampled_in_turn(c, seed):
     return slope * torch.arange(c.shape[2])
 
 
+def in_degrees(c, seed):
+    """Channels whose phases are degrees, rounded to a tenth, that were taken as radians."""
+    wide = c.to(torch.complex128)
+    return torch.polar(wide.abs(), wide.angle().rad2deg().round(decimals=1)).to(c.dtype)
+
+
+def beside_the_base(p, seed):
+    """Positions 0.45 m beside the antenna, in another direction each."""
+    angle = 2 * math.pi * torch.rand(len(p), generator=drawn(seed), dtype=torch.float64)
+    return p + 0.45 * torch.stack([angle.cos(), angle.sin(), 0 * angle], dim=1)
+
+
+def from_zero_frequency(seed):
+    """Subcarriers in the order of an FFT, whose carriers ascend."""
+    data = scene(seed, count=32)
+    carriers = data.array.frequency_hz * torch.linspace(1, 1.01, 32, dtype=torch.float64)
+    return replace(data, channel=torch.fft.ifftshift(data.channel, dim=1), frequency_hz=carriers)
+
+
 def narrow(seed):
     data = scene(seed, n=4000)
     ahead = torch.nn.functional.normalize(data.direction.mean(dim=0), dim=0)
@@ -206,6 +225,9 @@ CAUSES = {  # measurements, and the statement of the cause of an error
         "in the order of text",
     ),
     "carrier of another band": (carrier_of_another_band, "the carrier is about"),
+    "phases in degrees": (with_channel(in_degrees), "phases in degrees were taken as radians"),
+    "beside the base": (with_position(beside_the_base), "as of positions that are wrong by about 0."),
+    "order of an FFT": (from_zero_frequency, "order of an FFT"),
     "elements in turn": (with_phases(sampled_in_turn, count=4), "another slope in each snapshot"),
     "two cables": (with_order(cycle(2)), "are exchanged"),
     "three cables": (with_order(cycle(3), shape=(3, 4)), "are exchanged"),
@@ -282,3 +304,15 @@ def check_unknown(name: str, seed: int) -> None:
 def test_no_cause_is_stated_of_other_errors(name, further):
     for seed in range(31, 70) if further else [31 + list(UNKNOWN).index(name), *LIKE_A_CARRIER.get(name, ())]:
         check_unknown(name, seed)
+
+
+@pytest.mark.data
+def test_a_quarter_turn_of_a_measured_array_is_named_although_the_array_could_reach_more(measured_data):
+    data = load_snapshots(measured_data / "ble-uca" / "as-described")
+    findings = inspect(data, grid=(16, 72))
+    assert findings.numbers["peak_to_line_of_sight_deg"] > 80
+    assert all("count from y instead of x" in cause for cause in findings.numbers["explanations"])
+    assert any("would fit in part if azimuths of the spectra count from y" in warning for warning in findings.warnings)
+    turned = inspect(load_snapshots(measured_data / "ble-uca" / "turned"), grid=(16, 72))
+    assert turned.numbers["peak_to_line_of_sight_deg"] < 25
+    assert not turned.numbers["explanations"]

@@ -81,6 +81,7 @@ NAMED = {
         placed(lambda p: p * FLIP_Y + torch.tensor([0.0, 17.0, 0.0], dtype=torch.float64)),
         "y of the positions counts from the other side (y = 17.",
     ),
+    "RSSI, positions in pixels": (placed(lambda p: p * torch.tensor([37.8, 37.8, 1.0])), "units in a metre (--scale 3"),
     "RSSI, positions in millimetres": (placed(shrunk), "the positions are in millimetres"),
     "RSSI, everything in millimetres": (placed(shrunk, receivers=True), "are positions in millimetres"),
     "RSSI, one value everywhere": (column(torch.full((300,), -70.0)), "one value everywhere: receiver01"),
