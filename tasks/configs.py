@@ -428,6 +428,10 @@ class UpdateConfig(ReadingConfig):
     follow: bool = False
     """take measurements line by line as they come, and print a line for each"""
 
+    @property
+    def endless(self) -> bool:
+        return self.follow
+
     def check(self) -> None:
         super().check()
         if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE_SUFFIX)):
@@ -544,3 +548,7 @@ class ViewConfig(Options):
     host: str = "127.0.0.1"
     """address to listen on; with an address of the network, others can see the page and change the floor plan, without a
     password"""
+
+    @property
+    def endless(self) -> bool:
+        return True

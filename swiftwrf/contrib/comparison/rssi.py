@@ -347,9 +347,9 @@ def compare(
     memo = keep or Memo()
     with refusing_executor(executor):
         steps = Steps(None, memo)
-        started = [steps.start(name, name, compute, name) for name in names]
+        started = [steps.start(name, f"fitting and testing {name}", compute, name) for name in names]
         if fewer:
-            steps.start("fewer rows", "fewer rows", study)
+            steps.start("fewer rows", "fitting fewer rows", study)
         values = {name: steps[name] for name in started}
         studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}
         by_rows = DataFrame.from_dict(studies["rows"], orient="index")
