@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("-V", "--version"):
         print(f"swiftwrf {version('swiftwrf-tasks')}")
         return 0
-    if name == "help" and options:
+    if name in ("-h", "--help", "help") and options:
         name, options = options[0], ["--help"]
     if name in ("-h", "--help", "help"):
         from tasks import configs

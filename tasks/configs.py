@@ -120,7 +120,7 @@ class RssiTaskConfig(ReadingConfig):
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
-    Example: swiftwrf rssi --rx 6 --data DIR
+    Example: swiftwrf rssi walk.csv
     """
 
     receivers: tuple[str, ...] = ("all",)
@@ -182,7 +182,7 @@ class LocateConfig(ReadingConfig):
     Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls.
     swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
 
-    Example: swiftwrf locate --rx all --data DIR
+    Example: swiftwrf locate walk.csv
     """
 
     data: str | None = None

@@ -115,9 +115,10 @@ def test_version_and_help_as_words(capsys):
     assert capsys.readouterr().out == f"swiftwrf {version('swiftwrf-tasks')}\n"
     assert main(["help"]) == 0
     assert capsys.readouterr().out.startswith("usage: swiftwrf COMMAND")
-    with pytest.raises(SystemExit, match="0"):
-        main(["help", "rssi"])
-    assert capsys.readouterr().out.startswith("usage: swiftwrf rssi ")
+    for words in (["help", "rssi"], ["--help", "rssi"], ["-h", "rssi"]):
+        with pytest.raises(SystemExit, match="0"):
+            main(words)
+        assert capsys.readouterr().out.startswith("usage: swiftwrf rssi ")
 
 
 @pytest.mark.parametrize("task", ["aoa", "rssi", "locate"])

@@ -117,7 +117,7 @@ def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
 
 
 def test_into_a_file_a_line_is_printed_at_least_every_20_seconds():
-    """By a clock of the test: each step with its own seconds, and the whole command where no step is computed."""
+    """Use a clock of the test: each step with its own seconds, and the whole command where no step is computed."""
     now = [100.0]
     shown = Terminal(lambda: now[0])
     shown.console = Console(file=io.StringIO(), width=20)

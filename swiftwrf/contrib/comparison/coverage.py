@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
-from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Values
 from swiftwrf.data import Rssi
@@ -119,7 +118,7 @@ def _coverages(
     """Return the coverage of any, of two and of each receiver on a floor, with the predicted and counted test scans."""
     names, found, fields, distance = chart.receiver_names, [], None, reach(model)
     if len(held_out) and not held_out.receiver_moves:
-        prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
+        prediction, detection = model.predict_detected(held_out), model.predict_detection(held_out)
         assert prediction.std is not None
         fields = prediction.mean.T, prediction.std.T, detection.T
     every = list(range(len(names)))
@@ -139,8 +138,3 @@ def _coverages(
             }
         found.append((coverage, row))
     return found
-
-
-def _detection(model: RssiModel | PairModel, rows: Rssi) -> Tensor:
-    offset = 0.0 if model.offsets is None else model.offsets.of(rows)[:, None]
-    return model.predict_detection(rows.transmitter_position, offset)
