@@ -40,8 +40,8 @@ def test_snapshots(tmp_path, capsys):
     assert numbers["peak_to_line_of_sight_deg"] < 3
     assert numbers["nearest_wavelengths"] == pytest.approx(numbers["nearest_m"] / WAVELENGTH)
     assert text.startswith(f"{tmp_path / 'source'}: array snapshots. 1 warning: correct the data first.")
-    assert "  The nearest other position" in text
-    assert "only models of the walls (geometry, hybrid) predict between them. Nothing to do." in text
+    assert "! The nearest other position" in text
+    assert "predict between them. They find few walls, if any; measure more densely." in text
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<figcaption>") == 3
