@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import KW_ONLY
 from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
@@ -115,7 +116,29 @@ class AoaConfig(ReadingConfig):
 
 
 @options
-class RssiTaskConfig(ReadingConfig):
+class FloorPlanConfig(ReadingConfig):
+    """Options of a command whose maps lie on an image of the floor."""
+
+    _: KW_ONLY
+    floor_plan: str | None = None
+    """an image to draw behind the maps, PNG or JPEG"""
+    floor_extent: tuple[float, float, float, float] | None = None
+    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
+
+    def check(self) -> None:
+        super().check()
+        if self.floor_plan is None and self.floor_extent is not None:
+            raise InputError("--floor-extent needs --floor-plan FILE")
+        if self.floor_extent is not None:
+            x0, x1, y0, y1 = self.floor_extent
+            if not (x0 < x1 and y0 < y1):
+                raise InputError(
+                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
+                )
+
+
+@options
+class RssiTaskConfig(FloorPlanConfig):
     """Predict RSSI maps of receivers, and report the errors.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
@@ -145,10 +168,6 @@ class RssiTaskConfig(ReadingConfig):
     rooms.geojson beside the data)"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
-    floor_plan: str | None = None
-    """an image to draw behind the maps, PNG or JPEG"""
-    floor_extent: tuple[float, float, float, float] | None = None
-    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
     """number of positions to suggest for the next measurements, those that make the coverage more certain"""
     scheduler: str | None = None
@@ -165,18 +184,10 @@ class RssiTaskConfig(ReadingConfig):
         for name in self.also:
             RSSI_PREDICTORS.check(name)
         self.check_read()
-        if self.floor_plan is None and self.floor_extent is not None:
-            raise InputError("--floor-extent needs --floor-plan FILE")
-        if self.floor_extent is not None:
-            x0, x1, y0, y1 = self.floor_extent
-            if not (x0 < x1 and y0 < y1):
-                raise InputError(
-                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
-                )
 
 
 @options
-class LocateConfig(ReadingConfig):
+class LocateConfig(FloorPlanConfig):
     """Locate transmitters from RSSI, or from the spectra of several antenna arrays, and report the errors.
 
     Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls.

@@ -86,7 +86,9 @@ def test_survey(tmp_path, capsys):
     assert run(write_survey(tmp_path / "walk"), "--out", tmp_path / "page") == 0
     text = capsys.readouterr().out
     first, *_, step, report = text.splitlines()
-    assert first.endswith("walk.csv: RSSI. Nothing looks wrong. Errors that the files alone do not reveal remain possible.")
+    assert first.endswith(
+        "walk.csv: RSSI. Nothing looks wrong. Errors that the files alone do not reveal remain possible."
+    )
     assert step == f"Go on: swiftwrf rssi {tmp_path / 'walk' / 'walk.csv'}"
     assert report == f"report: {tmp_path / 'page' / 'report.html'}"
     assert "60 rows of RSSI at 4 receivers" in text
