@@ -124,7 +124,7 @@ class RssiComparison(Comparison):
     def notes(self) -> list[str]:
         model, floors, notes = self._fitted, self.train.floors, super().notes
         if model.attenuation is not None and model.attenuation.db is not None and floors is not None:
-            notes.append(f"each of the {len(floors.names)} floors takes {model.attenuation.db:.1f} dB")
+            notes.append(f"each of the {len(floors.names)} floors attenuates by {model.attenuation.db:.1f} dB")
         return notes if model.detection is None else [*notes, model.detection.note(self.train.receiver_names)]
 
     def _columns(self, name: str) -> Mapping[str, Any]:
