@@ -81,7 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return without_reader()
         return 0
     if name == "completion":
-        from tasks.completion import InputError, script
+        from swiftwrf.errors import InputError
+        from tasks.completion import script
 
         try:
             print(script("".join(options), {name: command.options for name, command in COMMANDS.items()}))
