@@ -1,4 +1,4 @@
-"""Draw the figures of README and of the concepts page: python benchmarks/doc_figures.py --data DIR.
+"""Draw the figures of README, concepts and gallery: python benchmarks/doc_figures.py --data DIR.
 
 The result in README uses the measured data sets tetam-tracks and s23-200 in DIR. All other figures use built-in scenes.
 Text and axes are grey on a transparent background, so that the figures are legible on light and on dark pages.
@@ -22,6 +22,7 @@ from matplotlib.image import AxesImage
 from scipy.stats import norm
 
 import swiftwrf
+from swiftwrf.contrib.survey.plan import plan_coverage
 from swiftwrf.plotting import hatch, mark_direction, polar_spectrum
 from swiftwrf.positions import inside
 from swiftwrf.rssi.maps import RssiMap
@@ -64,7 +65,7 @@ def main(data: Path, only: str = "") -> None:
         data: Folder that contains tetam-tracks and s23-200.
         only: Name of one figure. Defaults to all.
     """
-    figures = {draw.__name__: draw for draw in (spectrum, synthetic, splits, intervals, locating)}
+    figures = {draw.__name__: draw for draw in (spectrum, synthetic, splits, intervals, locating, coverage, walls)}
     figures["result"] = partial(result, data)
     with matplotlib.style.context(STYLE):
         for name, draw in figures.items():
@@ -167,6 +168,44 @@ def locating() -> Figure:
         axes.plot(*test.transmitter_position[row, :2].numpy(), "*", color=INK, markersize=10, label="true position")
         axes.set_title(f"{int(test.rssi_dbm[row].isfinite().sum())} receivers detect the transmitter")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, columnspacing=1)
+    return figure
+
+
+def coverage() -> Figure:
+    """Return the coverage of three receivers of the simulated floor, before and after one further access point."""
+    figure = Figure(figsize=(8.5, 3.2), layout="constrained")
+    floor = swiftwrf.rssi_room(n=200).columns([0, 1, 2])
+    found = plan_coverage(swiftwrf.RssiModel().fit(floor), floor, above_dbm=-60)
+    for axes, title, value in zip(figure.subplots(1, 2), ("as surveyed", "one more"), found.probability, strict=True):
+        drawn = axes.scatter(
+            *found.cells[:, :2].T, c=value, s=14, marker="s", cmap="cividis", vmin=0, vmax=1, rasterized=True
+        )
+        axes.plot(*floor.receiver_position[:, :2].T, "^", color=TRAIN)
+        axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=f"probability above -60 dBm, {title}")
+    axes.plot(*found.candidates[list(found.chosen), :2].T, "X", color=TEST, markersize=9)
+    figure.colorbar(drawn, ax=figure.axes, label="probability")
+    return figure
+
+
+def walls() -> Figure:
+    """Return the walls of the built-in room by its truth, and those that 72 spectra determine."""
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    measured = swiftwrf.simulated_room(n=72)
+    model = swiftwrf.GeometryModel().fit(measured)
+    assert model.room is not None
+    for plane in model.room.planes:
+        axis = int(np.abs(plane.normal).argmax())
+        if axis < 2:
+            style = "-" if plane.probability >= 0.9 else "--"
+            draw = (axes.axvline, axes.axhline)[axis]
+            draw(plane.offset_m * plane.normal[axis], color=SYNTHETIC, linestyle=style)
+    axes.plot(*measured.position[:, :2].T, ".", color=TRAIN, label="measured spectra")
+    axes.plot(*measured.fixed_position[:2], "s", color=INK, label="array")
+    axes.set(
+        aspect="equal", xlabel="x [m]", ylabel="y [m]", title="walls that spectra determine (dashed: not identifiable)"
+    )
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=8)
     return figure
 
 

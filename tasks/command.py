@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in ("-V", "--version"):
         print(f"swiftwrf {version('swiftwrf-tasks')}")
         return 0
-    if name == "help" and options:
+    if name in ("-h", "--help", "help") and options:
         name, options = options[0], ["--help"]
     if name in ("-h", "--help", "help"):
         from tasks import configs
@@ -76,8 +76,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for option, meaning in meanings(General).items():
                 print(f"  {option:<9} {meaning}")
             print("\noptions of a command: swiftwrf COMMAND --help", flush=True)
+            print('completion of the shell: eval "$(swiftwrf completion bash)", or zsh, fish', flush=True)
         except BrokenPipeError:
             return without_reader()
+        return 0
+    if name == "completion":
+        from swiftwrf.errors import InputError
+        from tasks.completion import script
+
+        try:
+            print(script("".join(options), {name: command.options for name, command in COMMANDS.items()}))
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 2
         return 0
     if name not in COMMANDS:
         meant = [f"did you mean {close}?" for close in get_close_matches(name, COMMANDS, 1)]

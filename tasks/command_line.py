@@ -108,7 +108,7 @@ def execute(program: str, config_type: type[Config], task: Callable[[Config], No
     if general.open and not config_type.opens:
         raise InputError("this command writes no report; leave out --open")
     try:
-        with terminal.of(general):
+        with terminal.of(general, config.endless):
             task(config)
     except InputError as error:
         names = [] if finds else _reading_options(str(error).split())

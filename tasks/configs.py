@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import KW_ONLY
 from pathlib import Path, PurePath
 from typing import Annotated, Literal
 
@@ -124,12 +125,34 @@ def check_repeats(seed: int, repeats: int) -> None:
 
 
 @options
-class RssiTaskConfig(ReadingConfig):
+class FloorPlanConfig(ReadingConfig):
+    """Options of a command whose maps lie on an image of the floor."""
+
+    _: KW_ONLY
+    floor_plan: str | None = None
+    """an image to draw behind the maps, PNG or JPEG"""
+    floor_extent: tuple[float, float, float, float] | None = None
+    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
+
+    def check(self) -> None:
+        super().check()
+        if self.floor_plan is None and self.floor_extent is not None:
+            raise InputError("--floor-extent needs --floor-plan FILE")
+        if self.floor_extent is not None:
+            x0, x1, y0, y1 = self.floor_extent
+            if not (x0 < x1 and y0 < y1):
+                raise InputError(
+                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
+                )
+
+
+@options
+class RssiTaskConfig(FloorPlanConfig):
     """Predict RSSI maps of receivers, and report the errors.
 
     Without --data the built-in simulated floor is used. swiftwrf resume DIR.partial continues an interrupted run.
 
-    Example: swiftwrf rssi --rx 6 --data DIR
+    Example: swiftwrf rssi walk.csv
     """
 
     receivers: tuple[str, ...] = ("all",)
@@ -156,10 +179,6 @@ class RssiTaskConfig(ReadingConfig):
     rooms.geojson beside the data)"""
     preset: Preset = "quick"
     """of SwiftWRF and NeRF2: quick, or paper for the published head and field"""
-    floor_plan: str | None = None
-    """an image to draw behind the maps, PNG or JPEG"""
-    floor_extent: tuple[float, float, float, float] | None = None
-    """x0 x1 y0 y1 of that image [m] (default: as pixels of the image are the positions in the table)"""
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
     """number of positions to suggest for the next measurements, those that make the coverage more certain"""
     repeats: PositiveInt = 1
@@ -181,24 +200,16 @@ class RssiTaskConfig(ReadingConfig):
         if self.above and self.below:
             raise InputError("--above and --below exclude each other; give the one whose side is good")
         self.check_read()
-        if self.floor_plan is None and self.floor_extent is not None:
-            raise InputError("--floor-extent needs --floor-plan FILE")
-        if self.floor_extent is not None:
-            x0, x1, y0, y1 = self.floor_extent
-            if not (x0 < x1 and y0 < y1):
-                raise InputError(
-                    f"--floor-extent must be x0 x1 y0 y1 with x0 < x1 and y0 < y1, got {self.floor_extent}"
-                )
 
 
 @options
-class LocateConfig(ReadingConfig):
+class LocateConfig(FloorPlanConfig):
     """Locate transmitters from RSSI, or from the spectra of several antenna arrays, and report the errors.
 
     Without --data the built-in simulated floor is used, with --stations 3 an office with arrays on three walls.
     swiftwrf resume DIR.partial continues an interrupted run. Positions of new rows: swiftwrf predict.
 
-    Example: swiftwrf locate --rx all --data DIR
+    Example: swiftwrf locate walk.csv
     """
 
     data: str | None = None
@@ -444,6 +455,10 @@ class UpdateConfig(ReadingConfig):
     follow: bool = False
     """take measurements line by line as they come, and print a line for each"""
 
+    @property
+    def endless(self) -> bool:
+        return self.follow
+
     def check(self) -> None:
         super().check()
         if self.follow and self.source != "-" and not self.source.lower().endswith((".ndjson", ".jsonl", TABLE_SUFFIX)):
@@ -560,3 +575,7 @@ class ViewConfig(Options):
     host: str = "127.0.0.1"
     """address to listen on; with an address of the network, others can see the page and change the floor plan, without a
     password"""
+
+    @property
+    def endless(self) -> bool:
+        return True

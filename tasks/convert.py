@@ -185,7 +185,7 @@ def _write_map(data: RssiMap, file: Path) -> str:
     match file.suffix.lower():
         case ".tif":
             write_geotiff(file, data)
-            return f"{described}, a band a receiver"
+            return f"{described}, a band per receiver"
         case ".geojson":
             write_geojson(file, data)
             return described

@@ -62,9 +62,11 @@ def run(config: InspectConfig) -> None:
             "numbers": findings.numbers,
         }
         write_json(folder / "inspect.json", content)
-        read_as = _kept(config, how, folder, out)
-        write_page(folder, page(findings, kind, config, read_as))
-    terminal.page(content, f"{config.source}: {kind}\n{findings}", out / "report.html")
+        found = page(findings, kind, config, _kept(config, how, folder, out))
+        write_page(folder, found)
+    first, *_ = found.summary.conclusion
+    steps = "\n".join(f"{step.text}: {step.code}" for step in found.summary.next_steps)
+    terminal.page(content, f"{config.source}: {kind}. {first}\n\n{findings}\n\n{steps}", out / "report.html")
 
 
 def _kept(config: InspectConfig, how: Reading, folder: Path, out: Path) -> list[str]:
@@ -92,10 +94,10 @@ def page(findings: Findings, kind: str, config: InspectConfig, read_as: Sequence
     rows = [[level, text] for level, text in findings.sentences]
     table = Table(["level", "finding"], rows, strong=frozenset(["warning"]), long=True)
     if isinstance(data, Rssi):
-        position, task = data.transmitter_position, ("rssi", "--rx", "all")
+        position, task = data.transmitter_position, ["rssi"]
         plots = [_floor(data), *([_against_distance(data)] if data.located else [])]
     else:
-        position, task = data.position, ("aoa", "--mix", "0.3")
+        position, task = data.position, ["aoa", "--mix", "0.3"]
         plots = [_plan(data), _directions(data), *([_neighbours(data)] if len(data) > 1 else [])]
     extent = " x ".join(f"{side:.2f}" for side in (position.amax(dim=0) - position.amin(dim=0)).tolist())
     numbers = [
@@ -104,7 +106,7 @@ def page(findings: Findings, kind: str, config: InspectConfig, read_as: Sequence
         Number(f"{extent} m", "extent of the positions, x by y by z"),
     ]
     again = NextStep("Correct the warnings and inspect again", command("inspect", config.source, *read_as))
-    steps = [*([again] if warnings else []), NextStep("Go on", command(*task, "--data", config.source, *read_as))]
+    steps = [*([again] if warnings else []), NextStep("Go on", command(task[0], config.source, *task[1:], *read_as))]
     conclusion = ["Nothing looks wrong. Errors that the files alone do not reveal remain possible."]
     if warnings:
         conclusion = [
@@ -114,7 +116,7 @@ def page(findings: Findings, kind: str, config: InspectConfig, read_as: Sequence
     return Page(
         f"Inspection: {data.name}",
         Summary(numbers, plots[:1], conclusion, steps),
-        [Section("Findings", tables=[table]), Section("Figures", plots=plots[1:])],
+        [Section("Findings", tables=[table]), *([Section("Figures", plots=plots[1:])] if plots[1:] else [])],
     )
 
 

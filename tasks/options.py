@@ -102,6 +102,11 @@ class Options:
     opens: ClassVar[bool] = True  # whether --open has something to show
     _: KW_ONLY
 
+    @property
+    def endless(self) -> bool:
+        """True for a command that runs until it is stopped."""
+        return False
+
     def check(self) -> None:
         """Refuse options that are wrong whatever the data. Subclasses extend it.
 

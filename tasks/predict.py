@@ -6,6 +6,7 @@ from contextlib import suppress
 from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
+import numpy as np
 from pandas import DataFrame
 
 from augment.estimators import Estimator
@@ -73,7 +74,11 @@ def run(config: PredictConfig) -> None:
         if isinstance(model, RssiPredictor):
             table = with_intervals(table, model, prediction)
         write_table(out, rounded(table.to_dict("records")))
-        terminal.page({"table": str(out)}, f"{shown(table)}{len(table)} rows: {out}")
+        few, text = len(position) <= MAX_SHOWN < len(table), ""
+        if few and isinstance(model, RssiPredictor):
+            strongest = prediction.mean.argmax(dim=1).numpy() + np.arange(len(position)) * len(model.receiver_names)
+            text = f"strongest receiver at each position:\n{shown(table.iloc[strongest])}"
+        terminal.page({"table": str(out)}, f"{text or shown(table)}{len(table)} rows: {out}")
         return
     if isinstance(model, RssiLocator):
         data, is_known = read_rssi(with_groups(how, model.model.offsets))

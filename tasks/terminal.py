@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import threading
 import time
 import webbrowser
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,7 @@ LOGGERS = ("swiftwrf", "augment", "tasks")  # whose messages --verbose shows
 PLAIN_WIDTH = 140  # characters of a table that is not shown on a terminal
 MAX_USABLE, MAX_REFERENCES = 5, 2  # rows of the short table
 SPEED_PERIOD_S = 120  # over which the speed is averaged for the time left
+MAX_SILENCE_S = 20.0  # between two lines of a command that works and whose output is no terminal
 logger = logging.getLogger(__name__)
 
 
@@ -118,28 +120,41 @@ class Terminal:
     Attributes:
         console: Where notes and progress go. It is silent with `--quiet` and `--json`.
         options: General options of the command.
+
+    Args:
+        clock: Function of the time [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self.console = Console(stderr=True, highlight=False, soft_wrap=True)
         self.options = General()
         self._progress: Progress | None = None
         self._done = self._expected = 0
         self._steps: dict[str, tuple[str, int, float]] = {}  # those computed now: title, number, time of the beginning
+        self._clock, self._doing = clock, ""
+        self._began = self._printed = clock()  # the command, and its last line
 
     @contextmanager
-    def of(self, options: General) -> Iterator[None]:
-        """Show what the options ask for, during the context; with `verbose` also the messages of `logging`."""
+    def of(self, options: General, endless: bool = False) -> Iterator[None]:
+        """Show what the options ask for, during the context; with `verbose` also the messages of `logging`.
+
+        A command whose output is no terminal prints a line at least every 20 s, unless it is endless.
+        """
         self.options = options
+        self._began, self._doing, ended = self._clock(), "working", threading.Event()
+        self._printed = self._began
         self.console.quiet = options.quiet or options.json
         handler = RichHandler(console=self.console, show_path=False)
         loggers = [logging.getLogger(name) for name in LOGGERS] if options.verbose else []
         for each in loggers:
             each.addHandler(handler)
             each.setLevel(logging.DEBUG)
+        if not endless:
+            threading.Thread(target=self._remind_until, args=(ended,), daemon=True).start()
         try:
             yield
         finally:
+            ended.set()
             self.options, self.console.quiet = General(), False
             for each in loggers:
                 each.removeHandler(handler)
@@ -160,20 +175,32 @@ class Terminal:
                 yield
             finally:
                 self._progress = None
+                self._steps, self._doing = {}, "writing the results"
+
+    def remind(self) -> None:
+        """Print what is computed, and for how long, if the last line is 20 s old."""
+        now = self._clock()
+        if now - self._printed >= MAX_SILENCE_S:
+            steps = [f"{self._numbered(name)}: {now - began:.0f} s" for name, (_, _, began) in [*self._steps.items()]]
+            self._log("; ".join(steps) or f"{self._doing}: {now - self._began:.0f} s")
+
+    def _remind_until(self, ended: threading.Event) -> None:
+        while not ended.wait(MAX_SILENCE_S / 20):
+            self.remind()
 
     def expect(self, steps: int) -> None:
-        """Add steps to those that are to be done."""
+        """Add steps to those that are to be done, or remove some."""
         self._expected += steps
 
     def begin(self, name: str, title: str) -> None:
         """Show that a step is computed now, by its unique name."""
-        self._steps[name] = title, self._done + len(self._steps) + 1, time.perf_counter()
+        self._steps[name] = title, self._done + len(self._steps) + 1, self._clock()
         self._log(self._numbered(name))
         self._update()
 
     def end(self, name: str, result: str = "") -> None:
         """Count a step as done, and show its result."""
-        seconds = time.perf_counter() - self._steps[name][2]
+        seconds = self._clock() - self._steps[name][2]
         self._log(f"{self._numbered(name)}: {result + ', ' if result else ''}{seconds:.1f} s")
         del self._steps[name]
         self._done += 1
@@ -185,6 +212,7 @@ class Terminal:
 
     def _log(self, line: str) -> None:
         """Print a line where no progress is shown; messages of `--verbose` contain it anyway."""
+        self._printed = self._clock()
         logger.debug("%s", line)
         if not self.console.is_terminal and not logger.isEnabledFor(logging.DEBUG):
             self.console.print(line, markup=False, soft_wrap=True)

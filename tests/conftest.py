@@ -146,6 +146,8 @@ def locate_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def make(folder: Path) -> None:
         with quick.recorded(folder):
-            assert quick.run("locate", "--cells", 300, "--out", folder / "run", drawn=True) == 0
+            Image.new("RGB", (40, 30), "white").save(folder / "plan.png")
+            plan = ("--floor-plan", folder / "plan.png", "--floor-extent", 0, 20, 0, 15)
+            assert quick.run("locate", "--cells", 300, *plan, "--out", folder / "run", drawn=True) == 0
 
     return made_once(tmp_path_factory, "locate", make) / "run"

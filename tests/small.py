@@ -7,6 +7,7 @@ from typing import Any, get_type_hints
 from unittest import mock
 
 from swiftwrf import MatchedField, RssiModel, Spectra
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.contrib.published import NeRF2Rssi
 from swiftwrf.contrib.published.base import Config
 from swiftwrf.contrib.published.generative import DcganConfig, VaeConfig
@@ -128,3 +129,18 @@ def glances() -> Iterator[None]:
         mock.patch.object(Search, "improve", lambda search, room: room),
     ):
         yield
+
+
+class Counted(Memo):
+    """The steps that are to be done in all, at each beginning of one."""
+
+    def __init__(self, folder=None):
+        super().__init__(folder)
+        self.begun, self.expected, self.totals = [], 0, []
+
+    def expect(self, steps):
+        self.expected += steps
+
+    def begin(self, name, title):
+        self.begun.append(title)
+        self.totals.append(self.expected)

@@ -120,7 +120,7 @@ def test_the_readme_prints_what_it_shows(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["formats", "locating", "update"])
+@pytest.mark.parametrize("name", ["formats", "locating", "python", "update"])
 def test_blocks_of_reference_and_how_to_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with cheap(), known_planes(FLOOR):

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from itertools import zip_longest
+from typing import Any
 
 import torch
 
@@ -91,22 +92,49 @@ def turbo_learning(
 
 def learn(experiment: Experiment, keep: Memo, executor: Executor | None = None) -> list[TurboResult]:
     """Return the result of each measured fraction. Measured subsets are computed side by side."""
-    steps = Steps(experiment, keep, executor)
-    results = {fraction: TurboResult(experiment, fraction, keep) for fraction in experiment.fractions}
-    subsets = [
-        _Learning(experiment, subset, steps, results[subset.measured_fraction]).phases()
-        for subset in experiment.subsets
-    ]
-    for _ in zip_longest(*subsets):
-        pass
+    steps, rehearsal = Steps(experiment, keep, executor), _Rehearsal(experiment)
+    for some in (rehearsal, steps):
+        results = {fraction: TurboResult(experiment, fraction, keep) for fraction in experiment.fractions}
+        subsets = [
+            _Learning(experiment, subset, some, results[subset.measured_fraction]) for subset in experiment.subsets
+        ]
+        for _ in zip_longest(*(subset.phases() for subset in subsets)):
+            pass
+        # one more for each fraction: the estimator that is recommended
+        steps.expect(len(rehearsal.names) + len(results) if some is rehearsal else len(results))
+    for subset in subsets:
+        subset.collect()
     for result in results.values():
         if result.chosen is None or (condition := result.chosen[0]).method in result.files:
             continue
         if isinstance(experiment.make_estimator(condition.estimator, 0), Saved):
-            title = f"{condition.method}, which is recommended"
+            title = f"training {condition.method}, which is recommended"
             steps[steps.start(f"chosen-{condition.result_name}", title, evaluate, condition, CHOSEN)]
             result.files[condition.method] = CHOSEN
     return list(results.values())
+
+
+class _Rehearsal(Steps[Experiment]):
+    """Steps that are counted and not computed, as if every search finds a room and extra positions are recommended."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        chosen = [
+            *(name for name in experiment.named if not experiment.model_type(name).slow),
+            *candidates(experiment.train),
+        ]
+        self.names: set[str] = set()
+        self.assumed = {
+            "planes": True,
+            "choice": {"name": chosen[0]},
+            "cross_validation": {name: {"recommended_n_synthetic": 1} for name in chosen},
+        }
+
+    def start(self, name: str, *_: Any, **__: Any) -> str:
+        self.names.add(name)
+        return name
+
+    def __getitem__(self, name: str) -> Row:
+        return self.assumed
 
 
 class _Learning:
@@ -131,7 +159,7 @@ class _Learning:
             self.blind = [replace(subset, without=folds) for folds in experiment.blind_folds(subset)[1]]
 
     def phases(self) -> Iterator[None]:
-        """Start all steps, and add their values to the result.
+        """Start all steps.
 
         Yield before each wait for values, so that other subsets start their steps.
         """
@@ -139,17 +167,20 @@ class _Learning:
         yield
         self.use_rooms()
         yield
-        compared = self.steps[self.choice] if self.compares else {}
-        names = self.experiment.named or [compared["choice"]["name"]]
-        validation = compared.get("cross_validation", {})
-        trainings = {name: self.experiment.trainings(validation.get(name)) for name in names}
+        self.compared = self.steps[self.choice] if self.compares else {}
+        self.names = self.experiment.named or [self.compared["choice"]["name"]]
+        validation = self.compared.get("cross_validation", {})
+        trainings = {name: self.experiment.trainings(validation.get(name)) for name in self.names}
         self.predict(trainings)
         yield
-        for name in names:
+        for name in self.names:
             self.steps[self.synthesis(name)]
             self.train_turbo(name, trainings[name])
-        yield
-        self.collect(compared, names)
+
+    def titled(self, title: str) -> str:
+        """Return the title of a step, with the measured fraction and the repeat where there are several."""
+        of = f", {self.subset.measured_fraction:.0%} measured" if len(self.experiment.fractions) > 1 else ""
+        return title + of + (f", repeat {self.subset.repeat + 1}" if self.experiment.repeats > 1 else "")
 
     def synthesis(self, name: str) -> str:
         """Return the name of the step in which a field model predicts spectra."""
@@ -172,8 +203,9 @@ class _Learning:
             saved_as = condition.name if condition.is_turbo else f"{condition.name}-measured"
             self.result.files[condition.method] = saved_as
         # trainings on synthetic spectra begin last and take longest
+        title = f"{'training and ' * (estimator in self.experiment.trainable)}testing {condition.method}"
         self.steps.start(
-            condition.result_name, condition.method, evaluate, condition, saved_as, first=condition.is_turbo
+            condition.result_name, self.titled(title), evaluate, condition, saved_as, first=condition.is_turbo
         )
         return condition
 
@@ -185,7 +217,10 @@ class _Learning:
         # the training of the paper's network takes too long to be repeated
         repeated = [one for one in conditions if not (one.is_network and self.experiment.preset == "paper")]
         first = conditions[0]
-        name, title = f"held_out_{first.result_name}", f"held-out spectra, {first.training_set}"
+        name = f"held_out_{first.result_name}"
+        title = self.titled(
+            f"testing on held-out spectra, {first.training_set if first is not self.located else first.name}"
+        )
         self.held_out.append(
             self.steps.start(name, title, hold_out, self.subset, repeated, rooms, first=first.is_turbo)
         )
@@ -193,7 +228,10 @@ class _Learning:
     def find(self, subset: MeasuredSubset | None = None) -> str:
         """Start the search for the room in the measured spectra, or in those of a subset of them; return its name."""
         subset = subset or self.subset
-        return self.steps.start(f"room-{subset}", "finding the room", find_room, subset, first=True)
+        title = "finding the room"
+        if subset in self.blind:
+            title += f" without held-out spectra, {self.blind.index(subset) + 1} of {len(self.blind)}"
+        return self.steps.start(f"room-{subset}", self.titled(title), find_room, subset, first=True)
 
     def room_of(self, part: MeasuredSubset) -> str:
         """Return the name of a search without the spectra that a part holds out."""
@@ -215,11 +253,12 @@ class _Learning:
         """Compare field models, and locate held-out spectra and test spectra by the room."""
         if self.compares:
             rooms = [self.steps[self.find(part)] for part in self.blind]
-            self.steps.start(self.choice, "comparing field models", compare, self.subset, self.fast, rooms, first=True)
+            title = self.titled("comparing field models")
+            self.steps.start(self.choice, title, compare, self.subset, self.fast, rooms, first=True)
         if self.searches and all(self.steps[self.room_of(part)].get("planes") for part in self.parts):
             self.hold([self.located], with_room=True)
         if self.searches and (room := self.steps[self.find()]).get("planes"):
-            self.steps.start(self.located.result_name, LOCATED, locate, self.subset, room)
+            self.steps.start(self.located.result_name, self.titled(f"locating by {LOCATED}"), locate, self.subset, room)
 
     def predict(self, trainings: dict[str, list[tuple[Training, int]]]) -> None:
         """Predict spectra by the field models that were asked for or chosen, and by others for comparison."""
@@ -227,7 +266,7 @@ class _Learning:
         for name in sorted(self.models, key=self.experiment.finds_room):
             room = self.steps[self.find()] if self.experiment.finds_room(name) else None
             extra = trainings[name][-1][1] if name in trainings else None
-            title = f"synthesizing spectra by {name}"
+            title = self.titled(f"synthesizing spectra by {name}")
             self.steps.start(
                 self.synthesis(name), title, synthesize, self.subset, name, extra, room, first=name in trainings
             )
@@ -247,11 +286,11 @@ class _Learning:
         if not experiment.model_type(name).slow:
             self.hold(turbo, experiment.finds_room(name))
 
-    def collect(self, compared: Row, names: list[str]) -> None:
+    def collect(self) -> None:
         """Add the values of all steps to the result."""
         steps, result = self.steps, self.result
         for name in self.models:
-            result.add_synthesis(self.subset, name, name in names, steps[self.synthesis(name)])
+            result.add_synthesis(self.subset, name, name in self.names, steps[self.synthesis(name)])
         for condition in self.conditions:
             result.add(condition, steps[condition.result_name])
         if self.searches:
@@ -261,6 +300,6 @@ class _Learning:
         for condition in self.full:
             result.add(condition, steps[condition.result_name])
         if self.subset.repeat == 0:
-            result.compared = compared
+            result.compared = self.compared
         for name in self.held_out:
             result.held_out |= steps[name]["errors"]

@@ -324,33 +324,47 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         )
 
     @checked
-    def predict_detected(self, data: Rssi) -> Prediction:
+    def predict_detected(self, data: Rssi | Numbers) -> Prediction:
         """Predict the RSSI at least where it is measured, with shapes of `predict` at the positions of the data.
+
+        Args:
+            data: Measurements, or positions of the transmitter, tensor or array (n, 3) [m].
 
         Raises:
             InputError: As `aligned`.
         """
-        return self.predict(self.aligned(data).transmitter_position)
+        return self.predict(self.aligned(data).transmitter_position if isinstance(data, Rssi) else data)
 
     @checked
-    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
-        """Return the probability that each receiver detects a packet, float64 (n, R), at positions (n, 3) [m].
+    def predict_detection(self, position: Rssi | Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
+        """Return the probability that each receiver detects a packet, float64 (n, R).
 
         A predictor without a probability has 1 where its mean is above the limit of detection, else 0. All is 1 if every
         cell of the training rows has a value.
 
         Args:
-            position: Positions of the transmitter, tensor or array (n, 3) [m].
+            position: Positions of the transmitter, tensor or array (n, 3) [m], or measurements, whose offsets count.
             offset_db: Offset of the transmitter relative to the reference of `offsets`, one number or (n, 1) [dB].
 
         Raises:
-            InputError: As `predict`.
+            InputError: As `predict`, or as `aligned` for measurements.
 
         Example:
             >>> import swiftwrf
             >>> swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60)).predict_detection([[1.0, 2.0, 1.2]]).shape
             torch.Size([1, 12])
         """
+        if isinstance(position, Rssi):
+            data = self.aligned(position)
+            position, offset_db = data.transmitter_position, self._offset(data)
+        return self._detection_at(position, offset_db)
+
+    def _offset(self, data: Rssi | Numbers) -> Tensor | float:
+        """Return the offset of each row of measurements relative to the reference, (n, 1) [dB]; 0 where there are none."""
+        return 0.0 if self.offsets is None or not isinstance(data, Rssi) else self.offsets.of(data)[:, None]
+
+    def _detection_at(self, position: Numbers, offset_db: Tensor | float) -> Tensor:
+        """Return what `predict_detection` returns at positions."""
         with torch.no_grad():
             mean = self.predict(position).mean.double() + offset_db
         return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()

@@ -230,27 +230,29 @@ class RssiModel(RssiPredictor, Saved):
         return mean.float(), std.float()
 
     @checked
-    def predict_detected(self, data: Rssi) -> Prediction:
+    def predict_detected(self, data: Rssi | Numbers) -> Prediction:
         """Predict the RSSI of packets that are detected at the positions of the data; shapes as of `predict`.
 
         Near the limit of detection it is above the received power of all packets, which `predict` returns.
 
+        Args:
+            data: Measurements, or positions of the transmitter, tensor or array (n, 3) [m].
+
         Raises:
             InputError: As `aligned`.
         """
-        data = self.aligned(data)
+        data = self.aligned(data) if isinstance(data, Rssi) else data
         prediction = super().predict_detected(data)
         if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
-        offset = 0.0 if self.offsets is None else self.offsets.of(data)[:, None]
+        offset = self._offset(data)
         mean, std = self.detection.given_detection(prediction.mean.double() + offset, prediction.std.double())
         return replace(prediction, mean=(mean - offset).float(), std=std.float())
 
-    @checked
-    def predict_detection(self, position: Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
+    def _detection_at(self, position: Numbers, offset_db: Tensor | float) -> Tensor:
         if self.detection_field is None:
-            return super().predict_detection(position, offset_db)
+            return super()._detection_at(position, offset_db)
         with torch.no_grad():
             level = self.predict(position).mean.double() + offset_db
         return self.detection_field.probability(level, check_positions(position) - self.centre)

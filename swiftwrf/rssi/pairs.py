@@ -18,6 +18,7 @@ import torch
 from annotated_types import Gt, Lt
 from torch import Tensor
 
+from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import each_fold, folds, places
 from swiftwrf.errors import InputError
@@ -148,8 +149,10 @@ class PairPredictor(RssiPredictor):
         mean, std = in_batches(self._at_pairs, pair, BATCH_PAIRS)
         return mean.reshape(n, r), None if std is None else std.reshape(n, r)
 
-    def predict_detected(self, data: Rssi) -> Prediction:
+    def predict_detected(self, data: Rssi | Numbers) -> Prediction:
         """Predict the RSSI where it is measured; nan elsewhere, which saves time where a row has few receivers."""
+        if not isinstance(data, Rssi):
+            return self.predict(data)
         data = self.aligned(data)
         row, column = data.detected.nonzero(as_tuple=True)
         predicted = self.predict_pairs(data.transmitter_position[row], self.receiver_position[column])

@@ -17,6 +17,7 @@ from tasks.directory import Run
 from tasks.environment import choose_device
 from tasks.locate.page import page
 from tasks.locate.placement import write_poses
+from tasks.page.maps import FloorPlan
 from tasks.page.page import finish
 from tasks.page.receivers import with_receivers
 from tasks.page.shared import write_suggestion
@@ -41,7 +42,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
         data.check_power("a locator")
         how = None if config.data is None else reading(config, config.data)
         rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
-    source = data.source | (rooms.source if rooms else {})
+    plan = FloorPlan.stated(config, data.name, getattr(data, "plan_scale", None))
+    source = data.source | (rooms.source if rooms else {}) | (plan.source if plan else {})
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
@@ -55,6 +57,8 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
                 result: PositionComparison = compare_stations(data, **common)
             else:
                 result = compare(data, n_cells=config.cells, reference=reference, rooms=rooms, **common)
+        if plan is not None:
+            plan.save(directory.folder)
         if isinstance(result, LocateComparison):
             _conclude(result, config, directory)
         elif isinstance(result, StationsComparison):

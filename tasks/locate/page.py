@@ -19,6 +19,7 @@ from swiftwrf.plotting import corners_of
 from tasks import labels
 from tasks.locate.placement import poses_section
 from tasks.page import figures
+from tasks.page.maps import FloorPlan
 from tasks.page.page import Number, Page, Plot, Section, Summary, Table, number, provenance, sections_of
 from tasks.page.receivers import receivers_section
 from tasks.page.shared import (
@@ -44,7 +45,8 @@ BASELINES = {
 }  # by what receives: localizers without a model of the scene, and what they are together
 OF_STATIONS = ("stations", "alone_estimate", "alone_radius_80_m")
 STATIONS_TEXT = "; triangles: stations; dashed circles of their colours: 80 % credible regions by each station alone."
-TRUTH, ESTIMATE = "#cf4a4a", "#ffffff"
+TRUTH, ESTIMATE = "#cf4a4a", "#b07b10"
+MIN_SHOWN = 0.01  # density relative to its maximum from which on a map shows it
 COLUMNS = ["index", "place", "method", "position_error_m"]  # of the errors of methods
 COLOURS = labels.LOCALIZERS
 LIMITS_OF_STATIONS = (
@@ -172,6 +174,8 @@ def _overview(run: Records, name: str) -> Plot:
     own = errors[errors["method"] == OWN]
     truth, estimate = own[["truth_x_m", "truth_y_m"]].to_numpy(), own[["x_m", "y_m"]].to_numpy()
     figures.errors_in_plan(plan, truth, estimate, own["position_error_m"].to_numpy(), "position error [m]")
+    if (floor := FloorPlan.load(run.folder)) is not None:
+        floor.draw(plan)
     caption = (
         "Errors of the posterior in plan: a line from each true position (dot) to its estimate, coloured by the error."
     )
@@ -212,25 +216,30 @@ def _posteriors(run: Records, several: bool) -> Section:
         "its largest mass. Cross: true position; dot: estimate; circle: 80 % credible region; small dots: training "
         "positions" + (STATIONS_TEXT if "stations" in maps else ".")
     )
-    plot = Plot(f"posteriors-{run.file_name}", posteriors(maps), caption, data[np.isfinite(density)])
+    panels = posteriors(maps, FloorPlan.load(run.folder))
+    plot = Plot(f"posteriors-{run.file_name}", panels, caption, data[np.isfinite(density)])
     return Section("", plots=[plot, *([_overview(run, f"overview-{run.file_name}")] if several else [])])
 
 
-def posteriors(maps: Mapping[str, NDArray[Any]]) -> list[Figure]:
-    """Draw the posteriors of some test rows in plan, a panel each."""
+def posteriors(maps: Mapping[str, NDArray[Any]], plan: FloorPlan | None = None) -> list[Figure]:
+    """Draw the posteriors of some test rows in plan, a panel each, above the image of the floor."""
     shape = float(np.clip(np.ptp(maps["y"]) / max(np.ptp(maps["x"]), 1e-9), 0.4, 1.6))
     extent = corners_of(maps["x"], maps["y"])
     panels = []
     for i in range(len(maps["density"])):
         figure, ax = figures.panel(3.8, 0.6 + 2.8 * shape)
         truth, estimate = maps["truth"][i], maps["estimate"][i]
-        drawn = ax.imshow(maps["density"][i], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=1)
+        style: dict[str, Any] = {"cmap": "Blues", "vmin": 0, "vmax": 1, "alpha": 1.0 if plan is None else 0.75}
+        density = np.where(maps["density"][i] > MIN_SHOWN, maps["density"][i], np.nan)
+        drawn = ax.imshow(density, origin="lower", extent=extent, zorder=1, **style)
+        if plan is not None:
+            plan.draw(ax)
         ax.plot(*maps["training_position"].T[:2], ".", color="#888888", markersize=1, rasterized=True)
         if "stations" in maps:
             for colour, *of_station in zip(labels.OTHER_COLOURS, *(maps[name] for name in OF_STATIONS), strict=False):
                 place, alone, radius = of_station
                 ax.plot(*place[:2], "^", color=colour, markersize=7, clip_on=False)
-                style: dict[str, Any] = {"fill": False, "color": colour, "linewidth": 0.8, "linestyle": "--"}
+                style = {"fill": False, "color": colour, "linewidth": 0.8, "linestyle": "--"}
                 ax.add_patch(Circle(alone[i][:2], radius[i], **style))
         ax.add_patch(Circle(estimate[:2], maps["radius_80_m"][i], fill=False, color=ESTIMATE, linewidth=1))
         ax.plot(*estimate[:2], "o", color=ESTIMATE, markeredgecolor="#000001", markersize=5)

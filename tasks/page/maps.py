@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
@@ -16,6 +18,7 @@ from swiftwrf import InputError
 from swiftwrf.positions import MAX_COORDINATE_M
 from swiftwrf.runtime.checkpoint import refusing
 from swiftwrf.runtime.durable import write_npz
+from tasks.configs import FloorPlanConfig
 from tasks.labels import COVERAGE
 from tasks.records import read_npz
 
@@ -81,6 +84,30 @@ class FloorPlan:
         edges = (-right, width - right, down - height, down)
         x0, x1, y0, y1 = (float(metres_per_pixel * edge) for edge in edges)
         return cls(pixels, (x0, x1, y0, y1))
+
+    @classmethod
+    def stated(cls, config: FloorPlanConfig, name: str, scale: float | None) -> FloorPlan | None:
+        """Return the plan of a command's options, or None. `scale` is that of data in pixels [pixels a metre].
+
+        Raises:
+            InputError: An image that cannot be read, or no edges for data that are not in its pixels.
+        """
+        if config.floor_plan is None:
+            return None
+        if config.floor_extent is None and scale is None:
+            raise InputError(f"--floor-plan needs --floor-extent x0 x1 y0 y1 [m], since {name} is not in its pixels")
+        pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
+        height, width = (side / (scale or 1.0) for side in pixels.shape[:2])
+        return cls(pixels, config.floor_extent or (0.0, width, -height, 0.0))
+
+    @property
+    def source(self) -> dict[str, str]:
+        """Digest of the plan, for the sources of a run."""
+        return {"floor plan": sha256(self.pixels.tobytes()).hexdigest()}
+
+    def draw(self, ax: Axes) -> None:
+        """Draw the plan behind what is in the axes."""
+        ax.imshow(self.pixels, extent=self.corners, aspect="equal", zorder=0)
 
     def save(self, folder: Path) -> None:
         """Write the plan into the directory of a run."""

@@ -5,17 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from augment.suggest import suggest_scans
-from swiftwrf import InputError, Rssi, RssiModel, rssi_room
+from swiftwrf import Rssi, RssiModel, rssi_room
 from swiftwrf.contrib.comparison.predictors import compared
 from swiftwrf.contrib.comparison.rssi import RssiComparison, compare
 from swiftwrf.data.coordinates import degree_columns
-from swiftwrf.data.files import sha256
 from swiftwrf.data.formats import RSSI_FORMATS
 from swiftwrf.models.prediction import difference_unit
 from tasks.configs import RssiTaskConfig
 from tasks.directory import Run
 from tasks.environment import choose_device
-from tasks.page.maps import FloorPlan, read_pixels
+from tasks.page.maps import FloorPlan
 from tasks.page.page import finish
 from tasks.page.receivers import with_receivers
 from tasks.page.shared import NOT_WORTH, is_worth, suggestions, write_suggestion
@@ -38,15 +37,14 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     how = None if config.data is None else reading(config, config.data)
     whole: Rssi = rssi_room(seed=config.seed) if how is None else how.read(RSSI_FORMATS)
     data = whole.receivers(config.receivers)
-    plan = _read_floor_plan(config, data)
+    plan = FloorPlan.stated(config, data.name, data.plan_scale)
     rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
     for reason in compared(data, config.also)[1].values() if data.is_power else ():  # others have no models of power
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
-    source = data.source | ({"floor plan": sha256(Path(config.floor_plan))} if config.floor_plan else {})
-    source |= rooms.source if rooms else {}
+    source = data.source | (rooms.source if rooms else {}) | (plan.source if plan else {})
 
     def described(value: Row) -> str:
         return f"{value['median']:.2f} {difference_unit(whole.unit)}" if "median" in value else ""
@@ -99,13 +97,3 @@ def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run) -> 
     degrees = degree_columns(train.origin, found.position.numpy())
     write_suggestion(directory.path(SUGGESTED), train.transmitter_position, found.position, found.variance, degrees)
     console.print(suggestions(found.position.numpy(), found.variance.numpy()), markup=False)
-
-
-def _read_floor_plan(config: RssiTaskConfig, data: Rssi) -> FloorPlan | None:
-    if config.floor_plan is None:
-        return None
-    if config.floor_extent is None and data.plan_scale is None:
-        raise InputError(f"--floor-plan needs --floor-extent x0 x1 y0 y1 [m], since {data.name} is not in its pixels")
-    pixels = read_pixels(config.floor_plan, f"--floor-plan {config.floor_plan}")
-    height, width = (side / (data.plan_scale or 1.0) for side in pixels.shape[:2])
-    return FloorPlan(pixels, config.floor_extent or (0.0, width, -height, 0.0))

@@ -270,7 +270,7 @@ class Maps:
         aspect: Literal["equal", "auto"] = "equal" if 1 / MAX_RATIO <= shape <= MAX_RATIO else "auto"
         figure, ax = figures.panel(width, 0.8 + legend + (width - 1.2) * float(np.clip(shape, 0.4, 1.6)))
         if (plan := self.plan) is not None:
-            ax.imshow(plan.pixels, extent=plan.corners, aspect="equal", zorder=0)
+            plan.draw(ax)
         ax.set(xlabel="x [m]", ylabel="y [m]")
         ax.grid(visible=False)
         return figure, ax, (extent, aspect)

@@ -354,7 +354,7 @@ class RssiView:
         return "\n".join(lines)
 
     def table(self, selection: MapSelection) -> str:
-        """Return the selected map as comma-separated values, a row a cell."""
+        """Return the selected map as comma-separated values, a row per cell."""
         if self.locating is not None and (found := self._located(selection)) is not None:
             is_error = selection.kind == "expected error"
             name = "expected_error_m" if is_error else f"posterior_of_row_{self.locating.rows.index[selection.row]}"

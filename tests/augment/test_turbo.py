@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import torch
 from quick import cheap
+from small import Counted
 
 from augment import turbo_learning
 from augment.estimators import Estimator
@@ -77,3 +78,24 @@ def test_a_call_continues_after_the_steps_that_it_kept_and_computes_the_others_i
     pd.testing.assert_frame_equal(again.errors, first.errors)
     changed = [file.stem for file, time in steps.items() if file.stat().st_mtime_ns != time]
     assert changed == ["kernel_regression_measured-mix0.5-r0"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"models": ["idw"], "estimators": ["peak"], "extra": 0},
+        {"models": ["idw", "gp"], "estimators": ["kernel_regression"], "repeats": 2},
+        pytest.param({"estimators": ["matched_field"]}, marks=pytest.mark.long),
+    ],
+    ids=["one", "two_repeated", "room"],
+)
+def test_the_number_of_steps_does_not_grow_and_no_two_titles_are_equal(data, tmp_path, options):
+    first, again = Counted(tmp_path), Counted(tmp_path)
+    with cheap():
+        turbo_learning(data, measured=0.5, keep=first, **options)
+    assert (np.diff(first.totals) <= 0).all(), first.totals
+    assert first.totals[-1] - len(first.begun) in (0, 1), "all are done, but for one that saves what is recommended"
+    assert len(set(first.begun)) == len(first.begun)
+    with cheap():
+        turbo_learning(data, measured=0.5, keep=again, **options)
+    assert again.begun == []

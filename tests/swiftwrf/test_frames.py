@@ -192,6 +192,7 @@ OF_RSSI = {
     RssiPredictor.update: (new_rows, lambda data: at_places(model().update(data)), tuple(CHANGES)),
     RssiModel.predict_detected: (new_rows, lambda data: by_name(model().predict_detected(data)), tuple(CHANGES)),
     RssiPredictor.predict_detected: (new_rows, lambda data: by_name(knn().predict_detected(data)), tuple(CHANGES)),
+    RssiPredictor.predict_detection: (new_rows, lambda data: model().predict_detection(data), tuple(CHANGES)),
     PairPredictor.predict_detected: (new_rows, lambda data: by_name(pairs().predict_detected(data)), tuple(CHANGES)),
     RssiPredictor.fit: (training_rows, lambda data: at_places(PairModel(new_places=False).fit(data)), FIT),
     swiftwrf.fit_rssi: (training_rows, lambda data: at_places(swiftwrf.fit_rssi(data)), FIT),

@@ -14,14 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 from fuzz.kinds import fitted
 from quick import run, said
 from samples import write_snapshots, write_survey
 
 from swiftwrf import AngularGrid, simulated_room
 from swiftwrf.data.writing import write_spectra
+from tasks import configs
 from tasks.command import COMMANDS, main
-from tasks.command_line import BROKEN_PIPE
+from tasks.command_line import BROKEN_PIPE, STYLE
 
 ROOT = Path(__file__).parents[2]
 
@@ -115,9 +117,39 @@ def test_version_and_help_as_words(capsys):
     assert capsys.readouterr().out == f"swiftwrf {version('swiftwrf-tasks')}\n"
     assert main(["help"]) == 0
     assert capsys.readouterr().out.startswith("usage: swiftwrf COMMAND")
-    with pytest.raises(SystemExit, match="0"):
-        main(["help", "rssi"])
-    assert capsys.readouterr().out.startswith("usage: swiftwrf rssi ")
+    for words in (["help", "rssi"], ["--help", "rssi"], ["-h", "rssi"]):
+        with pytest.raises(SystemExit, match="0"):
+            main(words)
+        assert capsys.readouterr().out.startswith("usage: swiftwrf rssi ")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_has_every_command_and_option(capsys, shell):
+    assert main(["completion", shell]) == 0
+    text = capsys.readouterr().out
+    for name, command in COMMANDS.items():
+        offered = re.search(rf'^ +{name}\) words="(.*)"', text, flags=re.MULTILINE)
+        words = offered[1].split() if offered else [f"--{word}" for word in re.findall(rf"from {name}' -l (.*)", text)]
+        parser = tyro.extras.get_parser(
+            getattr(configs, command.options), config=(*STYLE, tyro.conf.FlagCreatePairsOff)
+        )
+        taken = {word for action in parser._actions for word in action.option_strings if word.startswith("--")}
+        assert set(words) == taken - {"--help"} | {"--config", "--verbose", "--quiet", "--json", "--open"}, name
+    assert main(["completion", "tcsh"]) == 2
+    assert "completion is for bash, zsh, fish, got 'tcsh'" in said(capsys)
+
+
+def test_bash_completes():
+    """The shell itself is asked."""
+    words = (
+        'eval "$(python -m tasks completion bash)"; COMP_WORDS=({}); COMP_CWORD={}; _swiftwrf; echo "${{COMPREPLY[@]}}"'
+    )
+    for line, number, found in (
+        ("swiftwrf locate --fl", 2, "--floor-plan --floor-extent"),
+        ("swiftwrf r", 1, "rssi report resume"),
+    ):
+        done = subprocess.run(["bash", "-c", words.format(line, number)], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == found
 
 
 @pytest.mark.parametrize("task", ["aoa", "rssi", "locate"])

@@ -39,8 +39,9 @@ def test_snapshots(tmp_path, capsys):
     assert numbers["spacing_wavelengths"] == pytest.approx(0.5)
     assert numbers["peak_to_line_of_sight_deg"] < 3
     assert numbers["nearest_wavelengths"] == pytest.approx(numbers["nearest_m"] / WAVELENGTH)
+    assert text.startswith(f"{tmp_path / 'source'}: array snapshots. 1 warning: correct the data first.")
     assert "! The nearest other position" in text
-    assert "interpolators see no fringes" in text
+    assert "predict between them. They find few walls, if any; measure more densely." in text
     assert "needs no calibration" in text
     html = (tmp_path / "page" / "report.html").read_text()
     assert html.count("<figcaption>") == 3
@@ -84,6 +85,12 @@ def test_a_single_position(tmp_path, capsys):
 def test_survey(tmp_path, capsys):
     assert run(write_survey(tmp_path / "walk"), "--out", tmp_path / "page") == 0
     text = capsys.readouterr().out
+    first, *_, step, report = text.splitlines()
+    assert first.endswith(
+        "walk.csv: RSSI. Nothing looks wrong. Errors that the files alone do not reveal remain possible."
+    )
+    assert step == f"Go on: swiftwrf rssi {tmp_path / 'walk' / 'walk.csv'}"
+    assert report == f"report: {tmp_path / 'page' / 'report.html'}"
     assert "60 rows of RSSI at 4 receivers" in text
     assert "positions are unknown" in text
     assert (tmp_path / "page" / "report.html").read_text().count("<svg") == 1
@@ -148,7 +155,7 @@ def test_findings_are_the_numbers_of_snapshots():
         ("Taken over", [205.4, np.median(np.diff(time))]),
         ("positions, x", [60, *ranges(position)]),
         ("nearest other", [nearest, nearest / WAVELENGTH]),
-        ("line of sight, or", [75]),
+        ("have line of sight", [75]),
         ("Split walk", [45, 15]),
     ):
         assert numbers(found, words) == pytest.approx(expected, abs=0.0501), words

@@ -196,9 +196,14 @@ def test_few_predictions_are_shown_and_places_beyond_the_scans_are_marked(tmp_pa
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == list(table.columns)
     assert [line.split()[4] for line in lines[1:5]] == [f"{value:.2f}" for value in table["predicted_dbm"]]
-    pd.DataFrame(np.zeros((11, 3)), columns=["x", "y", "z"]).to_csv(at, index=False)
-    assert run("predict", tmp_path / "rssi.safetensors", at, "--out", tmp_path / "b.csv") == 0
-    assert capsys.readouterr().out == f"22 rows: {tmp_path / 'b.csv'}\n"
+    spread = torch.stack([data.transmitter_position[row] for row in range(21)])
+    for n in (20, 21):
+        pd.DataFrame(spread[:n].numpy(), columns=["x", "y", "z"]).to_csv(at, index=False)
+        assert run("predict", tmp_path / "rssi.safetensors", at, "--out", tmp_path / f"{n}.csv") == 0
+        *lines, last = capsys.readouterr().out.splitlines()
+        assert last == f"{2 * n} rows: {tmp_path / f'{n}.csv'}"
+        strongest = model.predict(spread[:n]).mean.max(dim=1).values.tolist() if n == 20 else []
+        assert [float(line.split()[4]) for line in lines[2:]] == pytest.approx(strongest, abs=0.00501)
 
 
 @pytest.mark.parametrize("suffix", [".xlsx", ".mat", "", ".parquet"])

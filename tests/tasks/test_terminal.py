@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from html import unescape
 from types import SimpleNamespace
 
@@ -115,6 +116,52 @@ def test_into_a_file_steps_have_a_line_at_their_start_and_their_end():
     assert fourth.startswith("[1/3] network, all measured: ")
 
 
+def test_into_a_file_a_line_is_printed_at_least_every_20_seconds():
+    """Use a clock of the test: each step with its own seconds, and the whole command where no step is computed."""
+    now = [100.0]
+    shown = Terminal(lambda: now[0])
+    shown.console = Console(file=io.StringIO(), width=20)
+
+    def lines_after(seconds):
+        before = len(shown.console.file.getvalue().splitlines())
+        now[0] += seconds
+        shown.remind()
+        return shown.console.file.getvalue().splitlines()[before:]
+
+    with shown.of(General(), endless=True):
+        assert lines_after(19) == []
+        assert lines_after(1) == ["working: 20 s"]
+        with shown.progress():
+            shown.expect(2)
+            shown.begin("a", "finding the room")
+            assert lines_after(19) == []
+            shown.begin("b", "testing peak")
+            assert lines_after(19) == []
+            assert lines_after(1) == ["[1/2] finding the room: 39 s; [2/2] testing peak: 20 s"]
+            assert lines_after(19) == []
+            shown.end("a")
+            assert lines_after(20) == ["[2/2] testing peak: 59 s"]
+            shown.end("b")
+        assert lines_after(20) == ["writing the results: 118 s"]
+    with shown.of(General(quiet=True), endless=True):
+        assert lines_after(100) == []
+
+
+def test_a_command_reminds_by_itself_and_an_endless_one_is_silent(monkeypatch):
+    monkeypatch.setattr("tasks.terminal.MAX_SILENCE_S", 0.02)
+    for endless in (True, False):
+        shown = Terminal()
+        shown.console = Console(file=io.StringIO(), width=20)
+        ends = time.perf_counter() + (0.2 if endless else 30)
+        with shown.of(General(), endless):
+            while not shown.console.file.getvalue() and time.perf_counter() < ends:
+                time.sleep(0.01)
+        printed = len(shown.console.file.getvalue())
+        assert bool(printed) is not endless
+    time.sleep(0.2)
+    assert len(shown.console.file.getvalue()) == printed, "it goes on after the end of the command"
+
+
 @pytest.mark.parametrize(
     ("run", "answered", "unit"),
     [
@@ -133,7 +180,9 @@ def test_a_run_shows_results_and_its_answer(request, run, answered, unit):
     assert steps.splitlines()[-1] == f"report: {folder / 'report.html'}"
     html = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
     assert first.removeprefix("50% measured: ").replace("`", "") in html
-    shown = re.findall(rf"^\[\d+/\d+\] (.*): ([\d.]+) {unit}, [\d.]+ s$", err, flags=re.MULTILINE)
+    shown = re.findall(
+        rf"^\[\d+/\d+\] (?:.*testing|locating by) (.*): ([\d.]+) {unit}, [\d.]+ s$", err, flags=re.MULTILINE
+    )
     found = pd.read_csv(folder / "errors.csv").groupby("method")
     assert len(shown) >= 4
     for name, text in shown if unit != "degrees" else ():

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pandas import DataFrame, concat
-from torch import Tensor
 
 from swiftwrf.contrib.comparison.base import Values
 from swiftwrf.data import Rssi
@@ -136,7 +135,7 @@ def _coverages(
     """
     names, found, fields, distance, (scans, held_out) = chart.receiver_names, [], None, reach(model), parts
     if len(held_out) and not held_out.receiver_moves:
-        prediction, detection = model.predict_detected(held_out), _detection(model, held_out)
+        prediction, detection = model.predict_detected(held_out), model.predict_detection(held_out)
         assert prediction.std is not None
         fields = prediction.mean.T, prediction.std.T, detection.T
     every, limit = list(range(len(names))), (threshold_dbm, model.scan_correlation, below)
@@ -157,8 +156,3 @@ def _coverages(
             }
         found.append((coverage, row))
     return found
-
-
-def _detection(model: RssiModel | PairModel, rows: Rssi) -> Tensor:
-    offset = 0.0 if model.offsets is None else model.offsets.of(rows)[:, None]
-    return model.predict_detection(rows.transmitter_position, offset)

@@ -339,7 +339,7 @@ def compare(
     begun = replace(begun, own=own)
     memo = keep or Memo()
     steps = Steps(begun, memo, executor)
-    started = [steps.start(name, name, LocateComparison.fit, name) for name in (*LOCALIZERS, *own)]
+    started = [steps.start(name, f"locating by {name}", LocateComparison.fit, name) for name in (*LOCALIZERS, *own)]
     values = {name: steps[name] for name in started}
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, RssiLocator)

@@ -145,7 +145,7 @@ class RssiComparison(Comparison):
     def notes(self) -> list[str]:
         model, floors, notes = self._fitted, self.train.floors, super().notes
         if model.attenuation is not None and model.attenuation.db is not None and floors is not None:
-            notes.append(f"each of the {len(floors.names)} floors takes {model.attenuation.db:.1f} dB")
+            notes.append(f"each of the {len(floors.names)} floors attenuates by {model.attenuation.db:.1f} dB")
         return notes if model.detection is None else [*notes, model.detection.note(self.train.receiver_names)]
 
     def _columns(self, name: str) -> Mapping[str, Any]:
@@ -401,11 +401,12 @@ def compare(
     memo = keep or Memo()
     with refusing_executor(executor):
         steps = Steps(None, memo)
-        started = [steps.start(name, name, compute, name) for name in names]
+        started = [steps.start(name, f"fitting and testing {name}", compute, name) for name in names]
         if fewer:
-            steps.start("fewer rows", "fewer rows", study)
+            steps.start("fewer rows", "fitting fewer rows", study)
         others = [
-            steps.start(f"split {number + 1}", f"split {number + 1}", repeat, number) for number in range(1, repeats)
+            steps.start(f"split {number + 1}", f"fitting and testing split {number + 1}", repeat, number)
+            for number in range(1, repeats)
         ]
         values = {name: steps[name] for name in started}
         studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}

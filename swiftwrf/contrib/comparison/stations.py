@@ -232,16 +232,21 @@ def compare_stations(
         keep.of(given | {"localizers": [STATION_LOCALIZERS[name] for name in STATION_LOCALIZERS]})
     memo = keep or Memo()
     steps = Steps(begun, memo, executor)
-    searches = [steps.start(f"room {name}", f"room of {name}", StationsComparison.room, name) for name in data.names]
+    alone, agrees = [ALONE + name for name in data.names], len(data.names) > 1 and not rooms
+    steps.expect(len(data.names) + agrees + len(STATION_LOCALIZERS) + len(alone) + 1)
+    searches = [
+        steps.start(f"room {name}", f"finding the room of {name}", StationsComparison.room, name) for name in data.names
+    ]
     for name in searches:
         steps[name]
-    if len(searches) > 1 and not rooms:
-        steps[steps.start("rooms agree", "rooms agree", StationsComparison.agree)]
-    alone = [ALONE + name for name in data.names]
-    started = [steps.start(name, name, StationsComparison.fit, name) for name in [*STATION_LOCALIZERS, *alone]]
+    if agrees:
+        steps[steps.start("rooms agree", "one room for all stations", StationsComparison.agree)]
+    started = [
+        steps.start(name, f"locating by {name}", StationsComparison.fit, name) for name in [*STATION_LOCALIZERS, *alone]
+    ]
     values = {name: steps[name] for name in started}
     directions = {name: [row[0] for row in values[ALONE + name]["direction"]] for name in data.names}
-    values[MATCHED] = steps[steps.start(MATCHED, MATCHED, StationsComparison.triangulate, directions)]
+    values[MATCHED] = steps[steps.start(MATCHED, f"locating by {MATCHED}", StationsComparison.triangulate, directions)]
     locator = load(memo.folder / LOCATOR)
     assert isinstance(locator, MatchedField)
     return replace(begun, values=values, locator=locator)

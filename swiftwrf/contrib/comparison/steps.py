@@ -131,7 +131,7 @@ class Memo:
             self.keep(ORIGIN, origin, seconds=0.0)
 
     def expect(self, steps: int) -> None:
-        """Take notice of further steps."""
+        """Take notice of further steps, or of fewer."""
 
     def begin(self, name: str, title: str) -> None:
         """Take notice of a step that is computed now."""
@@ -165,6 +165,12 @@ class Steps(Generic[Context]):
         self._values: dict[str, Row] = {}
         self._waiting: dict[str, tuple[bool, str, tuple[Any, ...]]] = {}
         self._pending: dict[Future[tuple[Row, float]], str] = {}
+        self._to_come = 0  # steps that the memo expects and that are not started
+
+    def expect(self, steps: int) -> None:
+        """Set how many more steps are started at most, so that the total of the memo does not grow."""
+        self.memo.expect(steps - self._to_come)
+        self._to_come = steps
 
     def start(self, name: str, title: str, function: Callable[..., Row], *arguments: Any, first: bool = False) -> str:
         """Let `function(context, folder, *arguments)` compute the values of a step. Return its name.
@@ -172,11 +178,13 @@ class Steps(Generic[Context]):
         A name that was started is not started again. With `first`, because others wait for it, the step precedes others.
         """
         if name not in self._values and name not in self._waiting and name not in self._pending.values():
+            self.expect(max(self._to_come, 1))
+            self._to_come -= 1
             if (value := self.memo.kept(name)) is not None:
                 self._values[name] = value
+                self.memo.expect(-1)
             else:
                 self._waiting[name] = first, title, (function, *arguments)
-                self.memo.expect(1)
         return name
 
     def __getitem__(self, name: str) -> Row:

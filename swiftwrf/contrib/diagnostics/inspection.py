@@ -85,7 +85,7 @@ def inspect(
         >>> import swiftwrf
         >>> findings = inspect(swiftwrf.simulated_room(n=50))
         >>> len(findings.warnings), findings.numbers["frame"]
-        (1, 'fits')
+        (0, 'fits')
     """
     if not (data.detected.any() if isinstance(data, Rssi) else len(data)):
         raise InputError(f"{data.name} holds no measurement to inspect")
@@ -117,7 +117,8 @@ def _check_positions(
     low, high = position.amin(dim=0), position.amax(dim=0)
     extent = (high - low).tolist()
     ranges = ", ".join(
-        f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+        f"{axis} {a:.2f} to {b:.2f}" if b > a else f"{axis} {a:.2f}"
+        for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
     )
     findings.add(f"{len(position)} positions, {ranges} m.", n=len(position), extent_m=extent)
     projected = projected or bool((position[:, :2].abs().amin(dim=0) > MIN_GRID_M).all())
@@ -144,8 +145,11 @@ def _check_positions(
     elif waves <= ROUGH:
         findings.add(f"{text}: interpolation will work in part; half a wavelength is the limit.")
     else:
-        geometry = "geometry needs none" if waves <= SPARSE else "geometry finds few planes, if any"
-        findings.warn(f"{text}: interpolators see no fringes between such positions; {geometry}.")
+        text += ": only models of the walls (geometry, hybrid) predict between them."
+        if waves <= SPARSE:
+            findings.add(f"{text} Nothing to do.")
+        else:
+            findings.warn(f"{text} They find few walls, if any; measure more densely.")
 
 
 def _add_splits(data: Spectra | Snapshots | Rssi, findings: Findings) -> None:
@@ -168,9 +172,12 @@ def _check_spectra(data: Spectra, findings: Findings) -> None:
     )
     _check_positions(data.position, findings, data.array.wavelength if data.array else None)
     free = float(data.line_of_sight.double().mean())
-    findings.add(
-        f"{free:.0%} of the positions have line of sight, or are not known to lack it.", line_of_sight_share=free
+    sight = (
+        f"{free:.0%} of the positions have line of sight."
+        if free < 1
+        else "No position is marked as without line of sight."
     )
+    findings.add(sight, line_of_sight_share=free)
     if data.array is None:
         findings.add(
             "The antenna array and its carrier are not described (give them with --array); coarray and geometry need them."

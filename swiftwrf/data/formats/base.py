@@ -161,6 +161,18 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
     try:
         matches = _readers(source, options, *registries)
         if not matches:
+            others: dict[str, Registry[Format[Any]]] = {
+                "spectra": SPECTRA_FORMATS,
+                "array snapshots": SNAPSHOT_FORMATS,
+                "RSSI": RSSI_FORMATS,
+            }
+            here = sorted(kind for kind, registry in others.items() if registry in registries)
+            for kind in others.keys() - here:
+                if _readers(source, options, others[kind]):
+                    commands = "rssi and swiftwrf locate" if kind == "RSSI" else "aoa"
+                    raise InputError(
+                        f"{source} looks like {kind}, which swiftwrf {commands} can read; expected {' or '.join(here)}"
+                    )
             raise InputError(
                 f"{source} is in none of the known formats ({known}); docs/formats.md describes them{_held(source)}"
             )

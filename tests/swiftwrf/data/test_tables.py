@@ -10,7 +10,7 @@ import torch
 from pyproj import Proj
 from samples import walk
 
-from swiftwrf import InputError, Rssi, load_rssi
+from swiftwrf import InputError, Rssi, load_rssi, load_spectra
 from swiftwrf.data.coordinates import GeodeticOrigin, PlanFrame
 from swiftwrf.data.receivers import read_places
 from swiftwrf.data.writing import write_rssi
@@ -360,6 +360,27 @@ def test_columns_that_are_no_receivers_are_not_asked_about(table):
     halves = np.where(one.x < 9, "west", "east")
     data = Rssi.from_frame(one.assign(wing=halves, phone=["p", "q"] * (N // 2), sf=["SF7", "SF9", "SF12"] * (N // 3)))
     assert data.receiver_names == ("rssi",)
+
+
+@pytest.mark.parametrize("name", ["Level", "Map", "Ebene"])
+def test_a_column_named_like_levels_is_the_floor_by_its_values_or_asked_about(table, name):
+    third = np.repeat(["Ground floor", "1st floor", "2nd floor"], N // 3)
+    data = Rssi.from_frame(table.assign(**{name: third}))
+    assert list(data.floors.names) == ["Ground floor", "1st floor", "2nd floor"]
+    assert data.transmitter_position[:, 2].tolist() == np.repeat([0.0, 4.0, 8.0], N // 3).tolist()
+    with pytest.raises(
+        InputError, match=rf"are the values of '{name}' floors \(office, store\).*--columns floor={name}"
+    ):
+        Rssi.from_frame(table.assign(**{name: ["office", "store"] * (N // 2)}))
+    battery = Rssi.from_frame(table.assign(**{name: 87}))
+    assert battery.floors is None
+
+
+def test_measurements_of_another_kind_are_named(table, tmp_path):
+    table.to_csv(tmp_path / "walk.csv", index=False)
+    words = "walk.csv looks like RSSI, which swiftwrf rssi and swiftwrf locate can read; expected array snapshots or spectra"
+    with pytest.raises(InputError, match=words):
+        load_spectra(tmp_path / "walk.csv")
 
 
 def test_columns_named_by_the_user(table):

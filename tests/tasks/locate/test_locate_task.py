@@ -19,7 +19,7 @@ from swiftwrf.contrib.comparison.locating import LocateComparison
 from swiftwrf.contrib.comparison.steps import LOCATOR as MODEL
 from swiftwrf.data.writing import write_spectra
 from swiftwrf.locate import MatchedField
-from tasks.locate.page import answer
+from tasks.locate.page import answer, page
 from tasks.predict import read_rssi
 from tasks.records import Records
 from tasks.source import Reading, aligned
@@ -110,6 +110,15 @@ def test_the_report_shows_errors_calibration_and_posteriors(locate_run):
     with np.load(locate_run / "maps.npz") as maps:
         assert maps["density"].shape == (6, len(maps["y"]), len(maps["x"]))
         assert np.nanmax(maps["density"], axis=(1, 2)) == pytest.approx(1)
+
+
+def test_posteriors_lie_on_the_floor_plan(locate_run):
+    panels = [panel for plot in page([Records(locate_run)]).plots if "posteriors" in plot.name for panel in plot.panels]
+    assert len(panels) == 6
+    for panel in panels:
+        density, plan = panel.axes[0].images
+        assert list(plan.get_extent()) == [0, 20, 0, 15]
+        assert plan.get_zorder() < density.get_zorder()
 
 
 def test_the_mean_position_is_recommended_where_the_posterior_is_behind_it_on_held_out_rows(locate_run):

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small import Counted
 
 import swiftwrf
 from swiftwrf.contrib.comparison.stations import ALONE, StationsComparison, compare_stations
-from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.locate import MatchedFieldConfig
 from swiftwrf.locate.triangulation import peak_directions
 from swiftwrf.models.geometry import GeometryModel, Plane
@@ -29,7 +29,10 @@ def result(run_folder) -> StationsComparison:
     part = data.derived(row=data.row.clone())
     part.row[::7, 1] = -1  # the second station did not receive each seventh transmission
     rooms = {name: GeometryModel.of_planes(part.of(name)[1], WALLS) for name in part.names}
-    return compare_stations(part, rooms=rooms, config=QUICK, keep=Memo(run_folder))
+    steps = Counted(run_folder)
+    result = compare_stations(part, rooms=rooms, config=QUICK, keep=steps)
+    assert set(steps.totals) == {len(steps.begun)}, "the number of steps does not grow"
+    return result
 
 
 def test_view_shows_the_room_of_each_station(result, run_folder):

@@ -27,6 +27,7 @@ from swiftwrf.contrib.comparison.rssi_baselines import NEIGHBOUR_COUNTS
 from swiftwrf.data.splits import folds
 from swiftwrf.rssi import RssiPredictor, compare
 from swiftwrf.runtime import registry
+from tasks.page.maps import FloorPlan
 from tasks.records import Records
 from tasks.report import merge
 from tasks.rssi import experiment
@@ -93,8 +94,7 @@ def run(*arguments):
 def test_a_floor_plan_whose_pixels_are_the_positions_needs_no_extent(tmp_path):
     Image.new("RGB", (400, 300), "white").save(tmp_path / "plan.png")
     config = SimpleNamespace(floor_plan=str(tmp_path / "plan.png"), floor_extent=None)
-    data = replace(rssi_room(n=12), plan_scale=20.0)
-    assert experiment._read_floor_plan(config, data).corners == (0, 20, -15, 0)
+    assert FloorPlan.stated(config, "walk", 20.0).corners == (0, 20, -15, 0)
 
 
 def test_whole_run(small, small_published, tmp_path):
