@@ -19,8 +19,9 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
+from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
 from swiftwrf.rssi.training import Bins, RssiTraining, choose_residual_kernels, rough_candidates
 
@@ -426,3 +427,24 @@ def test_the_kernel_has_the_lowest_error_of_processes_without_each_fold(generato
     assert [kernel for kernel, _ in chosen] == [compared[number] for number in lowest]
     without = residual.abs().flatten(0, 1).nanmean(dim=0).tolist()
     assert [has_field for _, has_field in chosen] == [score[n][k] < without[k] for k, n in enumerate(lowest)]
+
+
+@pytest.mark.parametrize("varied", ["nothing", "shift", "floors"])
+def test_rows_at_one_position_count_as_each_alone(generator, varied):
+    room = rssi_room(n=30)
+    position = room.transmitter_position.repeat(4, 1)
+    rssi = room.rssi_dbm.repeat(4, 1) + 3 * torch.randn(120, 12, generator=generator, dtype=torch.float64)
+    rssi[rssi < -70] = torch.nan
+    shift, crossed = torch.zeros_like(rssi), torch.zeros_like(rssi)
+    different = torch.arange(120)[:, None] % 7 * torch.ones(12).double()
+    shift, crossed = shift + different * (varied == "shift"), crossed + different * (varied == "floors")
+    curve = Detection(
+        rssi[~rssi.isnan()].min().repeat(12), 1.0, torch.full((12,), 0.02).double(), torch.ones(12).bool()
+    )
+    rows = room.receiver_position, rssi, "weak", shift, curve, crossed
+    together = fit_path_losses(position, *rows)
+    nearby = position + 1e-9 * torch.arange(120)[:, None]  # every row at a position of its own
+    alone = fit_path_losses(nearby, *rows)
+    for own, other in ((together.each, alone.each), (together.shared, alone.shared)):
+        torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(together.variance, alone.variance, atol=1e-5, rtol=1e-6)
