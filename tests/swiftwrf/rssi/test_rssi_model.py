@@ -24,6 +24,7 @@ from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
 from swiftwrf.rssi.training import Bins, RssiTraining, choose_residual_kernels, rough_candidates
+from swiftwrf.runtime.digest import computed_once
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
@@ -448,3 +449,24 @@ def test_rows_at_one_position_count_as_each_alone(generator, varied):
     for own, other in ((together.each, alone.each), (together.shared, alone.shared)):
         torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-6)
     torch.testing.assert_close(together.variance, alone.variance, atol=1e-5, rtol=1e-6)
+
+
+def test_predictors_of_the_same_rows_estimate_the_curve_of_detection_once():
+    data = rssi_room(n=60)
+    with_empty = data.derived(rssi_dbm=data.rssi_dbm.where(data.rssi_dbm > -65, torch.nan))
+    asked = []
+
+    def curve(position, rssi):
+        asked.append(rssi)
+        return Detection.estimate(position, rssi)
+
+    with mock.patch("swiftwrf.rssi.base._detection_curve", computed_once(curve)):
+        first, second = (RSSI_PREDICTORS[name]().fit(with_empty) for name in ("mean", "mri_receiver"))
+        assert len(asked) == 1
+        assert torch.equal(first.detection.limit, second.detection.limit)
+        changed = with_empty.rssi_dbm.clone()
+        changed[0, ~changed[0].isnan()] -= 1
+        other = RSSI_PREDICTORS["mean"]().fit(with_empty.derived(rssi_dbm=changed))
+    assert len(asked) == 2
+    expected = Detection.estimate(data.transmitter_position, changed)
+    assert torch.equal(other.detection.limit, expected.limit)
