@@ -56,13 +56,13 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure each case and write `results/survey_speed.json`."""
-    found = dict(kept("survey_speed", "cases"))
     for case in config.cases:
         name = f"locate {config.data.name}" if case == "locate" and config.data else case
         with TemporaryDirectory() as folder:
-            found[name] = workers(Path(folder)) if case == "workers" else measured(case, Path(folder), config)
-        print(name, json.dumps(found[name]), flush=True)
-        write_result("survey_speed", {"cases": dict(sorted(found.items()))}, rows=[found[name]])
+            found = workers(Path(folder)) if case == "workers" else measured(case, Path(folder), config)
+        print(name, json.dumps(found), flush=True)
+        cases = dict(kept("survey_speed", "cases")) | {name: found}
+        write_result("survey_speed", {"cases": dict(sorted(cases.items()))}, rows=[found])
 
 
 def measured(case: Case, folder: Path, config: Config) -> dict[str, Any]:
