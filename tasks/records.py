@@ -101,7 +101,8 @@ def _escaped_column(cells: pd.Series[Any]) -> NDArray[Any]:
     import numpy as np
 
     number, different = cells.factorize(use_na_sentinel=False)
-    return np.array([*map(_escaped, different), None], dtype=object)[number]
+    escaped: NDArray[Any] = np.array([*map(_escaped, different), None], dtype=object)[number]
+    return escaped
 
 
 def rounded(rows: Iterable[Row]) -> list[Row]:

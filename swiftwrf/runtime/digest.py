@@ -16,7 +16,8 @@ from torch import Tensor
 
 from swiftwrf.errors import InputError
 
-P, Result = ParamSpec("P"), TypeVar("Result")
+P = ParamSpec("P")
+Result = TypeVar("Result")
 OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
 DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 

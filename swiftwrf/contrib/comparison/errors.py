@@ -68,9 +68,9 @@ def resampled_median(values: ArrayLike, number: NDArray[np.int64]) -> Statistic:
     order = np.argsort(array, axis=None)
     ordered, of_value = array.ravel()[order], number[order // (array.size // len(array))]
     n_groups, size = int(number.max()) + 1, math.isqrt(len(ordered) - 1) + 1
-    blocks = np.full(size * -(-len(ordered) // size), n_groups)  # filled up with a group that no sample contains
-    blocks[: len(ordered)] = of_value
-    blocks = blocks.reshape(-1, size)
+    filled = np.full(size * -(-len(ordered) // size), n_groups)  # filled up with a group that no sample contains
+    filled[: len(ordered)] = of_value
+    blocks = filled.reshape(-1, size)
     at = blocks + (n_groups + 1) * np.arange(len(blocks))[:, None]
     in_block = np.bincount(at.ravel(), minlength=len(blocks) * (n_groups + 1)).reshape(len(blocks), -1)[:, :-1]
 
@@ -82,7 +82,8 @@ def resampled_median(values: ArrayLike, number: NDArray[np.int64]) -> Statistic:
             block = (up_to <= rank[:, None]).sum(axis=1)
             before = np.take_along_axis(np.pad(up_to, ((0, 0), (1, 0))), block[:, None], axis=1)
             within = before + np.take_along_axis(padded, blocks[block], axis=1).cumsum(axis=1)
-            return ordered[block * size + (within <= rank[:, None]).sum(axis=1)]
+            found: NDArray[np.float64] = ordered[block * size + (within <= rank[:, None]).sum(axis=1)]
+            return found
 
         return (value((n - 1) // 2) + value(n // 2)) / 2
 
