@@ -285,7 +285,7 @@ def _maximise(
         The fields of `PathLosses` by name, and the fraction `unexplained` (R,) of empty cells where a value was expected.
     """
     empty, count, total, squares = cells
-    n_receivers, varies = distance.shape[1], bool((distance.std(dim=0) > 0).any())
+    n_receivers, varies = distance.shape[1], bool(((distance - distance[0]).abs() > 0).any())
     middle = (count * distance).sum() / count.sum()
     feature = torch.stack([torch.ones_like(distance), distance - middle, -crossed])
     spread = torch.tensor([spread_db, spread_db, 1e-3]).double().square()  # diagonal of D; floors are alike
