@@ -45,15 +45,15 @@ def surveys() -> str:
     """Return seconds and memory of surveys of many receivers and rows, beside those of an earlier commit."""
     names = {
         "first": "`swiftwrf rssi` on the simulated floor",
-        "one": "`swiftwrf rssi --rx 6` there",
+        "one": "`swiftwrf rssi --rx 6` on that floor",
         "aoa": "`swiftwrf aoa --mix 0.3` in the simulated room",
         "packets": "5 million packets are read",
         "receivers": "`swiftwrf rssi` on 2,000 scans of 100 receivers",
         "scans": "1,000 scans are located among 500 receivers",
     }
-    rows = []
-    for name, found in load("survey_speed")["cases"].items():
-        if "here" in found:
+    rows, cases = [], load("survey_speed")["cases"]
+    for name in dict.fromkeys([*names, *cases]):
+        if "here" in (found := cases.get(name, {})):
             here, against = found["here"], found.get("against")
             cells = [f"{here[key]:.1f} s" for key in ("processor", "seconds")] + [f"{here['peak_gib']:.1f} GiB"]
             earlier = f"{against['processor']:.1f} s" if against else "-"
