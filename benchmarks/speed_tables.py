@@ -41,6 +41,34 @@ def profiles(min_share: float = 0.1) -> str:
     return markdown(["command", "function", "share, with all below"], rows)
 
 
+def surveys() -> str:
+    """Return seconds and memory of surveys of many receivers and rows, beside those of an earlier commit."""
+    names = {
+        "first": "`swiftwrf rssi` on the simulated floor",
+        "one": "`swiftwrf rssi --rx 6` on that floor",
+        "aoa": "`swiftwrf aoa --mix 0.3` in the simulated room",
+        "packets": "5 million packets are read",
+        "receivers": "`swiftwrf rssi` on 2,000 scans of 100 receivers",
+        "scans": "1,000 scans are located among 500 receivers",
+    }
+    rows, cases = [], load("survey_speed")["cases"]
+    for name in dict.fromkeys([*names, *cases]):
+        if "here" in (found := cases.get(name, {})):
+            here, against = found["here"], found.get("against")
+            cells = [f"{here[key]:.1f} s" for key in ("processor", "seconds")] + [f"{here['peak_gib']:.1f} GiB"]
+            earlier = f"{against['processor']:.1f} s" if against else "-"
+            rows.append([names.get(name, f"`swiftwrf {name}`"), *cells, earlier])
+    columns = ["case", "processor", "clock", "peak memory", "processor, earlier commit"]
+    return markdown(columns, rows)
+
+
+def workers() -> str:
+    """Return seconds of a run by the number of workers of a cluster."""
+    found = load("survey_speed")["cases"]["workers"]
+    rows = [[n, f"{seconds:.0f} s", f"{found['efficiency'][n]:.0%}"] for n, seconds in found["seconds"].items()]
+    return markdown(["workers", "seconds", "efficiency"], rows)
+
+
 def scaling() -> str:
     """Return processor seconds and peak memory of each stage at each size, and the growth to the largest size."""
     content = load("scaling")

@@ -43,18 +43,22 @@ CONTINUE = "go on with swiftwrf resume DIR.partial here, with --scheduler ADDRES
 
 
 class Workers(Executor):
-    """Processes of an executor that compute as this process would, on a device of the same type.
+    """Processes that compute as this process would, on a device of the same type.
 
-    `hold` makes an object available to all calls and returns what stands for it. `slots` returns the number of processes and
-    raises FitError if all are lost, which results raise, too.
+    `send` submits a call of a function with arguments. `hold` makes an object available to all calls and returns what stands
+    for it. `slots` returns the number of processes and raises FitError if all are lost, which results raise, too.
     """
 
     def __init__(
-        self, executor: Executor, hold: Callable[[object], Any], slots: Callable[[], int], device: torch.device
+        self,
+        send: Callable[..., Future[Any]],
+        hold: Callable[[object], Any],
+        slots: Callable[[], int],
+        device: torch.device,
     ) -> None:
         self.slots = slots
         self.machines: set[str] = set()  # that have returned a result
-        self._executor, self._hold, self._device = executor, hold, device.type
+        self._send, self._hold, self._device = send, hold, device.type
         self._function: Any = None
         self._held: Any = None
 
@@ -75,7 +79,7 @@ class Workers(Executor):
                 result.set_result(value)
 
         with without_main():
-            self._executor.submit(_call, terms, self._held, *arguments).add_done_callback(arrive)
+            self._send(_call, self._held, terms, *arguments).add_done_callback(arrive)
         return result
 
 
@@ -95,7 +99,7 @@ class _Result(Future[Any]):
 _ONE_AT_A_TIME = threading.Lock()  # a worker of Dask may have several threads
 
 
-def _call(terms: tuple[int, str, dict[str, str]], held: bytes | Path, *arguments: Any) -> tuple[Any, str]:
+def _call(held: bytes | Path, terms: tuple[int, str, dict[str, str]], *arguments: Any) -> tuple[Any, str]:
     """Call a held function in a worker and return its result with the name of the machine."""
     threads, device, versions = terms
     with _ONE_AT_A_TIME:
@@ -108,6 +112,17 @@ def _call(terms: tuple[int, str, dict[str, str]], held: bytes | Path, *arguments
         function = _loaded(held)
         set_threads(threads)  # after the libraries of the function are loaded, so that it reaches all of them
         return function(*arguments), machine(to_device(device))
+
+
+def _opened(packed: bytes, held: Any) -> Any:
+    """Call a packed function with a held object and the packed arguments."""
+    import pickle
+
+    call, arguments = pickle.loads(packed)
+    return call(held, *arguments)
+
+
+_opened.__module__ = "__main__"  # sent whole: a scheduler unpickles what it passes on, and then needs no torch
 
 
 @lru_cache(maxsize=1)
@@ -134,7 +149,7 @@ def local_processes(number: int, folder: Path) -> Iterator[Workers]:
     pool = ProcessPoolExecutor(number, process_context(), _begin)
     started = pool._processes  # the user's program may have other children
     try:
-        yield Workers(pool, hold, lambda: number, torch.device("cpu"))
+        yield Workers(pool.submit, hold, lambda: number, torch.device("cpu"))
     except BrokenProcessPool:
         pool.shutdown()  # its own thread reads exit codes, too, and each can be read once
         codes = filter(None, [process.exitcode for process in started.values()])
@@ -233,6 +248,12 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
     def hold(thing: object) -> Any:
         return client.submit(bytes, cloudpickle.dumps(thing), pure=False)
 
+    executor = client.get_executor(pure=False)
+
+    def send(call: Callable[..., Any], held: Any, *arguments: Any) -> Future[Any]:
+        future: Future[Any] = executor.submit(_opened, pickle.dumps((call, arguments)), held)
+        return future
+
     def stop() -> None:  # a computation that is cancelled goes on, and calls of the next run wait for it
         with suppress(Exception):  # the scheduler is gone, or a worker has no nanny to restart it
             computing = [worker for worker, keys in client.processing().items() if client.futures.keys() & keys]
@@ -240,7 +261,7 @@ def connected(address: str | None, device: torch.device) -> Iterator[Workers | N
 
     try:
         slots(InputError(f"the Dask scheduler at {address} has no workers; start some: `dask worker {address}`"))
-        yield Workers(client.get_executor(pure=False), hold, slots, device)
+        yield Workers(send, hold, slots, device)
     except KeyboardInterrupt:
         stop()
         raise

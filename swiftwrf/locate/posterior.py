@@ -200,11 +200,11 @@ class Posterior(Displayed):
 
         With floors it is that of the candidates on the most probable floor.
         """
-        position, weight = self.position.expand(len(self), -1, -1), self.weight
+        weight = self.weight
         if self.floors is not None:
             weight = weight * (self._floor_number == self.floor_probability.argmax(dim=1, keepdim=True))
             weight = weight / weight.sum(dim=1, keepdim=True)
-        return _geometric_median(position, weight, self.resolution_m)
+        return _geometric_median(self.position, weight, self.resolution_m)
 
     @property
     def _floor_number(self) -> Tensor:
@@ -241,8 +241,19 @@ class Posterior(Displayed):
         Raises:
             InputError: A level outside (0, 1).
         """
-        away = (self.position - self.median[:, None]).norm(dim=2)
-        return self.inflation * (self._radius(away, level) + self.resolution_m / 4)
+        return self.credible_radii([level])[:, 0]
+
+    def credible_radii(self, levels: Sequence[float]) -> Tensor:
+        """Return the radii of `credible_radius` for k levels together, (n, k).
+
+        Example:
+            >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
+            >>> posterior = Posterior(at, torch.tensor([[0.75, 0.25]], dtype=torch.float64).log(), 0.1)
+            >>> posterior.credible_radii([0.5, 0.9]).round(decimals=3).tolist()
+            [[0.025, 1.025]]
+        """
+        radii = self._radii(_distances(self.position, self.median), levels)
+        return self.inflation * (radii + self.resolution_m / 4)
 
     def direction(self, vectors: Tensor) -> Tensor:
         """Return the unit vector of the smallest expected angular error, (n, 3).
@@ -250,7 +261,7 @@ class Posterior(Displayed):
         Args:
             vectors: Unit vector towards each candidate, as `position`: (n, m, 3) or (1, m, 3).
         """
-        median = _geometric_median(vectors.expand(len(self), -1, -1), self.weight, 1e-4)
+        median = _geometric_median(vectors, self.weight, 1e-4)
         unit: Tensor = median / median.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return unit
 
@@ -261,26 +272,37 @@ class Posterior(Displayed):
         The width is five times the radius that contains 30 % of the mass, four to six standard deviations of a single mode,
         and at least `mode_width_m`.
         """
-        away = (self.position - self.most_likely[:, None]).norm(dim=2)
-        width = (5 * self._radius(away, 0.3) + self.resolution_m).clamp_min(self.mode_width_m)
+        away = _distances(self.position, self.most_likely)
+        width = (5 * self._radii(away, [0.3])[:, 0] + self.resolution_m).clamp_min(self.mode_width_m)
         second: Tensor = (self.weight * (away > width[:, None])).sum(dim=1) > 0.1
         return second
 
-    def _radius(self, away: Tensor, level: float) -> Tensor:
-        """Return the radius that contains a fraction of the mass, (n,), given the distances (n, m) of the candidates."""
-        order = away.argsort(dim=1)
+    def _radii(self, away: Tensor, levels: Sequence[float]) -> Tensor:
+        """Return the radii that contain k fractions of the mass, (n, k), given the distances (n, m) of the candidates."""
+        away, order = away.sort(dim=1)
         mass = self.weight.gather(1, order).cumsum(dim=1)
-        first = (mass < level).sum(dim=1).clamp(max=away.shape[1] - 1)
-        radius: Tensor = away.gather(1, order).gather(1, first[:, None])[:, 0]
-        return radius
+        first = torch.searchsorted(mass, torch.tensor(levels, dtype=mass.dtype).expand(len(mass), -1).contiguous())
+        return away.gather(1, first.clamp(max=away.shape[1] - 1))
+
+
+def _distances(point: Tensor, centre: Tensor) -> Tensor:
+    """Return the distances (n, m) of points (n, m, k), or (1, m, k) that all rows share, from centres (n, k)."""
+    exact = "donot_use_mm_for_euclid_dist"
+    if len(point) == 1:
+        return torch.cdist(centre, point[0], compute_mode=exact)
+    return torch.cdist(centre[:, None], point, compute_mode=exact)[:, 0]
 
 
 def _geometric_median(point: Tensor, weight: Tensor, smallest: float) -> Tensor:
-    """Return the geometric median (n, k) of points (n, m, k) with weights that sum to 1, from their mean."""
-    median = torch.einsum("nm,nmk->nk", weight, point)
+    """Return the geometric median (n, k) of points (n, m, k), or (1, m, k), with weights (n, m) that sum to 1."""
+
+    def weighted(weight: Tensor) -> Tensor:
+        return weight @ point[0] if len(point) == 1 else (weight[:, None] @ point)[:, 0]
+
+    median = weighted(weight)
     for _ in range(30):
-        pull = weight / (point - median[:, None]).norm(dim=2).clamp_min(max(smallest / 4, 1e-9))
-        median = torch.einsum("nm,nmk->nk", pull, point) / pull.sum(dim=1, keepdim=True)
+        pull = weight / _distances(point, median).clamp_min_(max(smallest / 4, 1e-9))
+        median = weighted(pull) / pull.sum(dim=1, keepdim=True)
     return median
 
 

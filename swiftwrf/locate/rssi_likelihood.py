@@ -144,7 +144,7 @@ class DetectionLikelihood:
 
         def loss(raw: NDArray[np.float64]) -> float:
             chance = cls._of(raw).probability(m).clamp(1e-4, 1 - 1e-4)
-            return -float(torch.where(d, chance.log(), (-chance).log1p()).mean())
+            return -float(chance.where(d, 1 - chance).log().mean())
 
         start = np.array([float(m.quantile(0.1)), 1.5, -2.0])
         fitted = cls._of(minimize(loss, start, method="Nelder-Mead", options={"maxiter": 300}).x)

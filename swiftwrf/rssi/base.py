@@ -24,6 +24,7 @@ from swiftwrf.positions import check_near, check_positions
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.rssi.scans import CORRELATION
+from swiftwrf.runtime.digest import computed_once
 from swiftwrf.runtime.threads import to_device
 from swiftwrf.runtime.validation import (
     Configured,
@@ -159,7 +160,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             shift = shift + train.offsets.of(pool)[:, None]
         if train.floors is not None:
             of_pool = FloorAttenuation(train.floors, (0,) * len(pool.receiver_names), 0.0)
-            of_pool = estimate_floor_attenuation(pool) if pool.is_power else of_pool
+            of_pool = _floor_attenuation(pool) if pool.is_power else of_pool
             columns = columns_of(self.receiver_names, pool).tolist()
             self.attenuation = replace(of_pool, receiver_floor=tuple(of_pool.receiver_floor[c] for c in columns))
             shift = shift + of_pool.of(pool.transmitter_position)
@@ -168,7 +169,7 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         if not pool.is_power:
             empty_cells = "unknown"
         if empty_cells == "weak" or (empty_cells == "auto" and pool.margin_db is None):
-            curve = Detection.estimate(pool.transmitter_position, pool.rssi_dbm + shift)
+            curve = _detection_curve(pool.transmitter_position, pool.rssi_dbm + shift)
         self.detection = curve and curve.columns(columns_of(self.receiver_names, pool))
         if empty_cells == "auto" and pool.margin_db is not None and math.isfinite(pool.margin_db):
             curve, of_lists = Detection.of_lists(pool.rssi_dbm + shift, pool.margin_db)
@@ -377,6 +378,10 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
             return f"{type(self).__name__}(not fitted)"
         n = len(self.receiver_names)
         return f"{type(self).__name__}(fitted, {n} {'receiver' if n == 1 else 'receivers'})"
+
+
+_detection_curve = computed_once(Detection.estimate)
+_floor_attenuation = computed_once(estimate_floor_attenuation)
 
 
 def in_batches(

@@ -185,6 +185,8 @@ def fit_path_losses(
         detection = None
     elif detection is None:
         detection = Detection.estimate(position, rssi + shift)
+    same, cells = _summed(position, rssi, floors, shift)
+    distance, floors, shift = distance[same], floors[same], shift[same]
     extent = float((position.amax(dim=0) - position.amin(dim=0)).max()) or 1.0
     n_cells = len((position / (extent / 10)).round().unique(dim=0))
     repeats = max(1.0, len(rssi) / n_cells)  # rows near each other have like errors
@@ -198,8 +200,9 @@ def fit_path_losses(
         for kind in (located, ~located):
             if bool(rssi[:, kind].isfinite().any()):
                 of_kind = curve and curve.columns(kind)
-                cells = distance[:, kind], floors[:, kind], rssi[:, kind], shift[:, kind]
-                for name, value in _maximise(*cells, of_kind, repeats, spread_db).items():
+                variance = rssi[:, kind][~rssi[:, kind].isnan()].var(correction=0).clamp_min(1e-6)
+                known = distance[:, kind], floors[:, kind], cells[..., kind], shift[:, kind]
+                for name, value in _maximise(*known, variance, of_kind, repeats, spread_db).items():
                     fields[name][kind] = value
         each, shared = (PathLoss(fields[f"{of}_level"], fields[f"{of}_slope"] * located) for of in ("each", "shared"))
         fields["root"][~located, :, 1] = 0.0
@@ -214,11 +217,33 @@ def fit_path_losses(
     return losses
 
 
+def _summed(position: Tensor, rssi: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+    """Return one row of each group of rows at one position that are equal in all others (n, R), and sums over the groups.
+
+    Sums (4, m, R) are the numbers of empty cells and of values, the sum of the values, and that of their squares.
+    """
+    number = position.unique(dim=0, return_inverse=True)[1]
+    order = torch.arange(len(number))
+
+    def first() -> Tensor:
+        return order.new_zeros(int(number.max()) + 1).scatter_reduce(0, number, order, "amin", include_self=False)
+
+    for values in others:
+        if not torch.equal(values[first()][number], values):
+            number = torch.cat([number[:, None], values], dim=1).unique(dim=0, return_inverse=True)[1]
+    value, same = rssi.nan_to_num(), first()
+    parts = rssi.isnan(), ~rssi.isnan(), value, value.square()
+    return same, torch.stack(
+        [value.new_zeros(len(same), rssi.shape[1]).index_add(0, number, x.to(value)) for x in parts]
+    )
+
+
 def _maximise(
     distance: Tensor,
     crossed: Tensor,
-    rssi: Tensor,
+    cells: Tensor,
     shift: Tensor,
+    variance: Tensor,
     detection: Detection | None,
     repeats: float,
     spread_db: float,
@@ -243,8 +268,9 @@ def _maximise(
     Args:
         distance: log10 distances (n, R) [m].
         crossed: Number of floors between both ends, (n, R).
-        rssi: Measurements (n, R) [dBm], nan where not detected.
+        cells: Sums over the rows of equal distances, see `_summed`, (4, n, R).
         shift: Received power less RSSI, (n, R) [dB].
+        variance: Variance of all values [dB^2].
         detection: Curve of detection; None if empty cells are ignored.
         repeats: Number of rows that count as one, since rows near each other have like errors.
         spread_db: See `fit_path_losses`.
@@ -258,21 +284,25 @@ def _maximise(
     Returns:
         The fields of `PathLosses` by name, and the fraction `unexplained` (R,) of empty cells where a value was expected.
     """
-    seen, n_receivers = ~rssi.isnan(), rssi.shape[1]
-    middle = distance[seen].mean()
-    feature = torch.stack([torch.ones_like(distance), distance - middle, -crossed], dim=-1)
+    empty, count, total, squares = cells
+    n_receivers, varies = distance.shape[1], bool(((distance - distance[0]).abs() > 0).any())
+    middle = (count * distance).sum() / count.sum()
+    feature = torch.stack([torch.ones_like(distance), distance - middle, -crossed])
     spread = torch.tensor([spread_db, spread_db, 1e-3]).double().square()  # diagonal of D; floors are alike
     prior = torch.tensor([1e-6, slope_prior[1] ** -2, floor_std_db**-2], dtype=torch.float64)  # diagonal of P
     prior_mean = torch.tensor([0.0, slope_prior[0], 0.0], dtype=torch.float64)
 
-    value, weight, value_variance = rssi.nan_to_num(), seen.double(), torch.zeros_like(rssi)
-    variance = rssi[seen].var(correction=0).clamp_min(1e-6).expand(n_receivers)
+    weak, weak_value, weak_variance = (torch.zeros_like(total) for _ in range(3))
+    variance = variance.expand(n_receivers)
     missed = torch.zeros(n_receivers).double() if detection is None else detection.missed
     unexplained, last = missed, None
-    limited = torch.zeros_like(seen) if detection is None else ~seen & detection.is_limit
+    limited = torch.zeros_like(empty) if detection is None else empty * detection.is_limit
     for _ in range(40):
-        weighted = (weight / (variance * repeats))[..., None] * feature
-        normal, right = torch.einsum("nrk,nrl->rkl", weighted, feature), (weighted * value[..., None]).sum(dim=0)
+        believed = limited * weak
+        weight, precision_of_row = count + believed, 1 / (variance * repeats)
+        products = [[(weight * one * other).sum(dim=0) for other in feature] for one in feature]
+        normal = torch.stack([torch.stack(row) for row in products]).permute(2, 0, 1) * precision_of_row[:, None, None]
+        right = ((total + believed * weak_value) * feature).sum(dim=1).T * precision_of_row[:, None]
         shrink = torch.linalg.inv(torch.eye(3, dtype=torch.float64) + normal @ spread.diag())
         precision = prior.diag() + (shrink @ normal).sum(dim=0)
         shared = torch.linalg.solve(precision, prior * prior_mean + (shrink @ right[..., None]).sum(dim=0)[:, 0])
@@ -284,22 +314,19 @@ def _maximise(
         moments = (deviation.square() + posterior.diagonal(dim1=1, dim2=2))[:, :2].sum(dim=0)
         spread[:2] = (moments + spread_worth * spread_db**2) / (n_receivers + spread_worth)
         each = shared + deviation
-        mean, count = (feature * each).sum(dim=-1), weight.sum(dim=0)
-        squares = (weight * ((value - mean).square() + value_variance)).sum(dim=0)
-        variance = _shrunk(squares, count, rows_worth).clamp_min(1e-6)
+        mean = (feature * each.T[:, None]).sum(dim=0)
+        of_values = squares - 2 * mean * total + count * mean.square()
+        of_empty = believed * ((weak_value - mean).square() + weak_variance)
+        variance = _shrunk((of_values + of_empty).sum(dim=0), weight.sum(dim=0), rows_worth).clamp_min(1e-6)
         if last is not None and float((each - last).abs().max()) < 0.01:
             break
         last = each
         if detection is not None and bool(limited.any()):
-            weak_value, weak, weak_variance = _expected(
-                mean, variance, detection.limit - shift, detection.width, unexplained
-            )
-            value, weight = rssi.where(seen, weak_value), weak.where(limited, seen.double())
-            value_variance = weak_variance.where(limited, 0.0)
-            if bool((distance.std(dim=0) > 0).any()):  # without distances no power is expected anywhere
-                # weak packets are missed at random, too
-                others = (1 - weak).where(limited, 0.0).sum(dim=0)
-                unexplained = missed.maximum(_shrunk(others, (seen | limited).sum(dim=0), rows_worth))
+            limit = detection.limit - shift
+            weak_value, weak, weak_variance = _expected(mean, variance, limit, detection.width, unexplained)
+            if varies:  # without distances no power is expected anywhere; weak packets are missed at random, too
+                others = (limited * (1 - weak)).sum(dim=0)
+                unexplained = missed.maximum(_shrunk(others, (count + limited).sum(dim=0), rows_worth))
     each_level, shared_level = each[:, 0] - each[:, 1] * middle, shared[0] - shared[1] * middle
     level_std, slope_std = (spread + precision.inverse().diagonal())[:2].sqrt().tolist()
     root = torch.tensor([[level_std, -float(middle) * slope_std], [0.0, slope_std]], dtype=torch.float64)

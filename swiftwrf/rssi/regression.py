@@ -61,7 +61,7 @@ def fit_receiver(number: int, data: RssiTraining, config: RssiConfig, device: to
     prior, root = torch.stack([loss.shared.level[number], loss.shared.slope[number]]), loss.root[number].clone()
     receiver, field_db = data.receiver[number, None], float(data.field_db[number])
     distance = log_distance(data.position, receiver)[:, 0]
-    used = (~rssi.isnan() | ~limit.isnan()).nonzero()[:, 0]
+    used = torch.cat([(~rssi.isnan() & limit.isnan()).nonzero()[:, 0], (~limit.isnan()).nonzero()[:, 0]])
     dual, tangent, variance = (torch.zeros_like(rssi) for _ in range(3))
     covariance, held_out = root @ root.T, rssi.new_full((len(data.folds), len(rssi)), torch.nan)
     if len(used):
@@ -183,7 +183,7 @@ def solve(
 
     Args:
         value: RSSI, or its upper limit, less the prior mean, (n,) [dB].
-        weak: Whether a value is an upper limit, bool (n,).
+        weak: Whether a value is an upper limit, bool (n,), true at the last values alone.
         feature: Regressors F, (n, k).
         covariance: Covariance K of the latent field c, (n, n) [dB^2].
         noise_db: Standard deviation of the noise, (n,) [dB].
@@ -201,7 +201,7 @@ def solve(
     weight, latent, noise = torch.ones_like(value), torch.zeros_like(value), noise_db.square()
     target, limit = value.masked_fill(weak, 0.0), value[weak]
     site = value.new_zeros(2, len(limit))  # precision, and precision times value, in place of each limit
-    unit = torch.eye(len(value)).to(value)[:, weak]
+    n_known = len(value) - len(limit)
     step, last_change, vague = 1.0, math.inf, 1e6  # variance of a limit without effect [dB^2]
     for _ in range(30):
         head, slope = (x[:, 0] for x in heads(latent[:, None]))
@@ -218,7 +218,8 @@ def solve(
         previous, weight = weight, huber_weight(variance * dual, noise_db, huber).masked_fill(weak, 1.0)
         settled = float((weight - previous).abs().max()) < weight_tolerance
         if censored is not None:
-            diagonal = torch.linalg.solve_triangular(factor, unit, upper=False).square().sum(dim=0)
+            # the last rows of S^-1 follow from those of its factor alone
+            diagonal = torch.cholesky_inverse(factor[n_known:, n_known:]).diagonal()
             others = target[weak] - dual[weak] / diagonal, (1 / diagonal - variance[weak]).clamp_min(1e-6)
             site = site + damping * (_site(*others, limit, noise[weak], censored) - site)
             previous = target[weak]

@@ -235,14 +235,21 @@ def choose_residual_kernels(
         for vertical in (1.0, 5.0)[: 1 + has_floors]
         for kernel in rough_candidates(position, noises)
     ]
-    covariance = [kernel(position, position) + (kernel.noise * noise_scale).diag() for kernel in kernels]
-    precision = torch.cholesky_inverse(torch.linalg.cholesky(torch.stack(covariance)))
-    dual, errors = torch.einsum("knm,mrl->knrl", precision, residual.nan_to_num()), []
-    for r, missing in enumerate(residual[..., 0].isnan().T):
+    covariance = torch.stack([kernel(position, position) + (kernel.noise * noise_scale).diag() for kernel in kernels])
+    of_all, errors = torch.cholesky_inverse(torch.linalg.cholesky(covariance)), []
+    patterns, number = (~residual[..., 0].isnan()).T.unique(dim=0, return_inverse=True)
+    for pattern, rows in enumerate(patterns):  # receivers that the same rows detect have the same covariances
+        own, missing = rows.nonzero()[:, 0], (~rows).nonzero()[:, 0]
+        kept, precision = slice(None), of_all
+        if len(missing) > len(own) / 2:  # the inverse of fewer rows takes less time than to hold out the missing ones
+            kept, own, missing = own, torch.arange(len(own)), missing[:0]
+            precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance[:, kept[:, None], kept]))
+        values = residual[kept][:, number == pattern].nan_to_num()
+        dual = precision @ values.flatten(1)
         # missing rows are held out with every fold, so that the zeros in their place have no effect
-        for out, _ in each_fold(fold, (~missing).nonzero()[:, 0]):
-            every = torch.cat([out, missing.nonzero()[:, 0]])
-            errors.append(held_out_errors(precision, dual[:, :, r], every)[:, : len(out)])
+        for out, _ in each_fold(fold[kept], own):
+            error = held_out_errors(precision, dual, torch.cat([out, missing]))[:, : len(out)]
+            errors.append(error.unflatten(2, values.shape[1:]).flatten(1, 2))
     noise = torch.tensor([kernel.noise for kernel in kernels])[:, None]
     score = torch.cat(errors, dim=1).abs().mean(dim=1)
     score, best = score.masked_fill(noise < torch.tensor(least_noise), torch.inf).min(dim=0)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import hashlib
 import pickle
 import sys
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from functools import cached_property
+from functools import cached_property, wraps
 from types import CodeType, FunctionType, ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from torch import Tensor
 
 from swiftwrf.errors import InputError
 
+P = ParamSpec("P")
+Result = TypeVar("Result")
 OF_VERSIONS = {*sys.stdlib_module_names, "swiftwrf", "augment", "tasks"}  # packages whose code changes with a version
 DESCRIPTORS = (property, cached_property, staticmethod, classmethod)
 
@@ -39,6 +42,32 @@ def digest(*values: Any) -> str:
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"results of these values cannot be kept ({error}); leave keep out") from None
     return sha256.hexdigest()
+
+
+def computed_once(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Return a function of one's own that keeps its last result, for a next call with equal arguments.
+
+    Predictors that are compared are fitted to the same rows one after another. The result must not be changed.
+
+    Example:
+        >>> negated = computed_once(lambda values: print("computed") or -values)
+        >>> negated(2), negated(2)
+        computed
+        (-2, -2)
+    """
+    last: list[tuple[str, Result]] = []
+
+    @wraps(function)
+    def wrapped(*arguments: P.args, **options: P.kwargs) -> Result:
+        key = digest(arguments, options)
+        for known, result in last:
+            if known == key:
+                return result
+        result = function(*arguments, **options)
+        last[:] = [(key, result)]
+        return result
+
+    return wrapped
 
 
 class _Content(pickle._Pickler):

@@ -6,7 +6,8 @@ import base64
 import io
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 from warnings import catch_warnings, filterwarnings
 
@@ -75,16 +76,23 @@ def short(name: str) -> str:
     return plain(name, NAME)
 
 
+def align(panels: Sequence[Figure]) -> None:
+    """Give panels with the same axes, labels and scales the places of the first one's axes, which are computed once."""
+    first, *others = panels
+    with _drawing():
+        _lay_out(first)
+    for figure in others:
+        figure.set_layout_engine("none")
+        for axes, placed in zip(figure.axes, first.axes, strict=True):
+            for which in ("original", "active"):
+                axes.set_position(placed.get_position(which == "original"), which)
+
+
 def as_svg(figure: Figure, title: str | None = None) -> str:
     """Return the figure as SVG without date or random names, with a title for readers who do not see it."""
     stream = io.StringIO()
-    canvas, dpi = FigureCanvasSVG(figure), figure.dpi
-    with matplotlib.style.context(STYLE), catch_warnings():
-        filterwarnings("ignore", "Glyph .* missing")  # of names in scripts that the font lacks
-        if (engine := figure.get_layout_engine()) is not None:  # savefig would draw the figure twice to place its parts
-            engine.execute(figure)
-            figure.set_layout_engine("none")
-            figure.dpi = dpi  # the layout changed it
+    with _drawing():
+        canvas = _lay_out(figure)
         metadata: dict[str, str | None] = {"Date": None, "Creator": None}
         if title is not None:
             metadata["Title"] = title
@@ -92,6 +100,24 @@ def as_svg(figure: Figure, title: str | None = None) -> str:
         canvas.print_svg(stream, metadata=metadata)  # type: ignore[no-untyped-call]
     svg = re.sub(r'(data:image/png;base64,\s*)([^"]+)', _with_palette, stream.getvalue())
     return re.sub(r' d="[^"]+"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), svg)  # tenths of a point
+
+
+@contextmanager
+def _drawing() -> Iterator[None]:
+    """Draw in the style of the reports."""
+    with matplotlib.style.context(STYLE), catch_warnings():
+        filterwarnings("ignore", "Glyph .* missing")  # of names in scripts that the font lacks
+        yield
+
+
+def _lay_out(figure: Figure) -> FigureCanvasSVG:
+    """Place the parts of a figure, and return its canvas, which would draw it twice for that."""
+    canvas, dpi = FigureCanvasSVG(figure), figure.dpi
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+        figure.dpi = dpi  # the layout changed it
+    return canvas
 
 
 def _with_palette(image: re.Match[str]) -> str:

@@ -243,22 +243,27 @@ class Maps:
     def by_receiver(self, kind: str, first: bool = True) -> Plot | None:
         """Return maps of the receivers that are strongest in the measured area: "predicted", or "width" of the intervals.
 
-        The `first` ones are those that are not folded. None if there are no others.
+        The `first` ones are those that are not folded. Widths are drawn where they vary. None if nothing is drawn.
         """
         a = self.arrays
         strength = a["predicted"][:, a["known"] if a["known"].any() else ...].reshape(len(self.names), -1).mean(axis=1)
         strongest = np.argsort(strength if self.is_below else -strength, kind="stable").tolist()
         most = max(FIRST_MAPS, MAX_MAPS // len(a["floor_names"]))
         shown = strongest[:FIRST_MAPS] if first else strongest[FIRST_MAPS:most]
+        if kind == "width":
+            shown = [i for i in shown if self._varies(a["width"][i])]
         if not shown:
             return None
         names, fields = [self.names[i] for i in shown], ("predicted", "width", "detection")
         data = self._cells({name: a[name][shown] for name in fields}, names)
         values = [{name: a[name][i] for name in fields} for i in shown]
         panels = [self._panel(each, kind, self.names[i], i, 3.6) for each, i in zip(values, shown, strict=True)]
+        figures.align(panels)
         what = f"Predicted {self.quantity}" if kind == "predicted" else f"Width of the {LEVEL:.0%} interval"
         best = "strongest" if self.unit == "dBm" else "best"
         which = f"the {len(shown)} {best} of {len(self.names)} receivers" if first else "the next ones"
+        if kind == "width":
+            which = f"those of the {min(FIRST_MAPS, len(self.names))} {best} receivers whose width varies"
         caption = f"{what} at {which}. {self.hatched} Hollow dots: nothing was received. A cross marks the receiver."
         name = ("map" if kind == "predicted" else "width") + ("" if first else "-more")
         return Plot(f"{name}-{self.run.file_name}{self.suffix}", panels, caption, data)
@@ -313,7 +318,10 @@ class Maps:
 
         The median is that of the measured cells, or of all if there are none.
         """
-        a, width = self.arrays, self.best["width"]
+        return self._widest(self.best["width"])
+
+    def _widest(self, width: NDArray[Any]) -> tuple[float, float, float, float]:
+        a = self.arrays
         row, column = np.unravel_index(np.where(a["inside"], width, -np.inf).argmax(), width.shape)
         typical = np.median(width[a["known"] if a["known"].any() else ...])
         return float(a["x"][column]), float(a["y"][row]), float(width[row, column]), float(typical)
@@ -321,7 +329,11 @@ class Maps:
     @property
     def varies(self) -> bool:
         """True if the widths of the intervals inside the scans differ so much that a map shows it."""
-        return self.widest[2] >= MIN_RATIO * self.widest[3]
+        return self._varies(self.best["width"])
+
+    def _varies(self, width: NDArray[Any]) -> bool:
+        *_, widest, typical = self._widest(width)
+        return widest >= MIN_RATIO * typical
 
     @cached_property
     def _widths(self) -> tuple[float, float]:

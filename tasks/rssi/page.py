@@ -69,7 +69,8 @@ def page(runs: list[Records]) -> Page:
     if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
         sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
         by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=_differences(run)))
-        details[:0] = [by_receiver, sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))]
+        widths = sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))
+        details[:0] = [by_receiver, *([widths] if widths.all_plots else [])]
     names = ", ".join(dict.fromkeys(run.place for run in runs))
     if len(runs) == 1:
         first = _summary(runs[0], answers[runs[0]])

@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 import swiftwrf
-from swiftwrf.contrib.comparison.errors import median_interval, method_summary, summary
+from swiftwrf.contrib.comparison.errors import (
+    median_interval,
+    method_summary,
+    paired_change,
+    paired_difference,
+    resampled_median,
+    summary,
+)
 from swiftwrf.locate import Posterior
 from swiftwrf.metrics import LEVEL, angle_errors, covered, interval_factor, ssim
 
@@ -131,3 +138,31 @@ def test_a_method_without_error_at_most_rows_has_few_pairs(n_pairs, mean, has_in
     assert found["n"] == n_pairs
     assert found["difference"] == pytest.approx(mean, nan_ok=True)
     assert np.isfinite(found[["difference_low", "difference_high"]].tolist()).tolist() == [has_interval] * 2
+
+
+@pytest.mark.parametrize("n_rows", [5, 6, 90])
+def test_intervals_over_places_are_those_of_rows_that_are_written_out(n_rows, monkeypatch):
+    monkeypatch.setattr("swiftwrf.contrib.comparison.errors.MAX_DRAWN", 50)  # several batches
+    draw = np.random.default_rng(4)
+    errors, other = draw.exponential(size=(n_rows, 3)), draw.exponential(size=(n_rows, 3)).round(1)  # ties
+    place = draw.permutation(np.arange(n_rows) ** 2 % (n_rows // 2))[:, None] * [1.0, 0.5]  # of several sizes
+    names, number = np.unique(place, axis=0, return_inverse=True)
+    draw = np.random.default_rng(0)
+    samples = [draw.integers(len(names), size=len(names)) for _ in range(1000)]
+    samples = [np.concatenate([np.flatnonzero(number == each) for each in sample]) for sample in samples]
+    found = summary(errors[:, 0], place)
+    expected = np.percentile([np.median(errors[rows, 0]) for rows in samples], (2.5, 97.5))
+    np.testing.assert_allclose([found["low"], found["high"]], expected)
+    found = paired_change(errors, other, place, n=1000)
+    changes = [np.median(other[rows]) / np.median(errors[rows]) - 1 for rows in samples]
+    np.testing.assert_allclose([found["low"], found["high"]], np.percentile(changes, (2.5, 97.5)))
+    index = pd.MultiIndex.from_arrays([range(n_rows), number], names=["index", "place"])
+    pairs = pd.DataFrame({"a": errors[:, 0], "b": other[:, 0]}, index)
+    expected = np.percentile([(errors - other)[rows, 0].mean() for rows in samples], (2.5, 97.5))
+    np.testing.assert_allclose(paired_difference(pairs, "a", "b", min_groups=2)[1:], expected)
+
+
+def test_a_median_of_one_value_and_of_groups_that_a_sample_lacks():
+    times = np.array([[2.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    assert resampled_median([3.0, 1.0], np.array([0, 1]))(times).tolist() == [3.0, 1.0, 2.0]
+    assert resampled_median([4.0], np.array([0]))(np.ones((2, 1))).tolist() == [4.0, 4.0]

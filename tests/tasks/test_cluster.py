@@ -12,7 +12,7 @@ import dask
 import pytest
 import torch
 from quick import run, said
-from sums import STEPS, Sum, add, kill, kill_once, results, sleep
+from sums import STEPS, Sum, add, kill, kill_once, refuse, results, sleep
 from test_rssi_model import with_field
 
 from swiftwrf import FitError, InputError, fit_rssi
@@ -152,13 +152,16 @@ def test_workers_that_never_come_or_go_for_good(tmp_path, monkeypatch):
 
 @pytest.fixture
 def scheduler(tmp_path):
-    """A scheduler and a worker in processes of their own: that of the scheduler, and its address."""
+    """A scheduler without torch and a worker, in processes of their own: that of the scheduler, and its address."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
     file = tmp_path / "scheduler.json"
+    lacking = "import sys; sys.modules |= dict.fromkeys(('torch', 'swiftwrf', 'augment', 'tasks', 'sums'));"
 
     def start(program, *options):
-        command = [sys.executable, "-m", f"distributed.cli.dask_{program}", "--scheduler-file", str(file), *options]
-        return subprocess.Popen([*command, "--no-dashboard"], env=environment, stderr=subprocess.DEVNULL)
+        begin = lacking if program == "scheduler" else "import sys;"
+        command = [sys.executable, "-c", f"{begin} from distributed.cli.dask_{program} import main; main()"]
+        command += ["--scheduler-file", str(file), *options, "--no-dashboard"]
+        return subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
 
     processes = [start("scheduler", "--host=127.0.0.1", "--port=0"), start("worker", "--nthreads=1", "--no-nanny")]
     while not file.exists():
@@ -168,6 +171,17 @@ def scheduler(tmp_path):
     for process in processes:
         process.kill()
         process.wait()
+
+
+def test_a_scheduler_without_torch_gives_results_and_reasons(scheduler, tmp_path):
+    _, address = scheduler
+    here, _ = results(tmp_path / "here", STEPS)
+    with connected(address, CPU) as cluster:
+        there, _ = results(tmp_path / "there", STEPS, cluster=cluster)
+        assert [value["sum"] for _, value in there] == [value["sum"] for _, value in here]
+        assert next(iter(cluster.map(torch.neg, [torch.ones(2)]))).tolist() == [-1, -1]
+    with connected(address, CPU) as cluster, pytest.raises(InputError, match="no such number"):
+        results(tmp_path / "refused", [Sum(1, function=refuse)], cluster=cluster)
 
 
 def test_a_run_that_loses_its_scheduler_continues_here(scheduler, tmp_path):

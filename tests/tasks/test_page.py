@@ -180,6 +180,20 @@ def test_labels_of_a_plan_with_equal_scales_lie_inside_the_figure():
     assert figure.axes[1].get_tightbbox().x1 <= figure.bbox.width
 
 
+def test_aligned_panels_are_drawn_as_each_alone():
+    def drawn():
+        for title, factor in (("first", 1), ("second", 2)):
+            figure, axes = figures.panel(3.6, 3)
+            image = axes.imshow(factor * np.arange(12.0).reshape(3, 4), vmin=0, vmax=24)
+            axes.set(title=title, xlabel="x [m]", ylabel="y [m]")
+            figures.colour_bar(axes, image, "value")
+            yield figure
+
+    aligned = list(drawn())
+    figures.align(aligned)
+    assert [figures.as_svg(figure) for figure in aligned] == [figures.as_svg(figure) for figure in drawn()]
+
+
 @pytest.mark.parametrize("repeats", [1, 3])
 def test_between_positions_on_a_line_is_inside_however_often_each_was_measured(repeats):
     known = np.repeat([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], repeats, axis=0)

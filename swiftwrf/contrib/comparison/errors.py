@@ -40,27 +40,78 @@ class ErrorSummary(TypedDict):
     n: int
 
 
-def bootstrap_interval(
-    statistic: Callable[[NDArray[np.int64]], float], group: ArrayLike, n: int = 1000
-) -> tuple[float, float]:
+Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Function of the numbers of times (samples, groups) that samples contain each group; it returns a value for each sample."""
+MAX_DRAWN = 2**22  # groups of samples that are held at once
+
+
+def group_numbers(group: ArrayLike) -> NDArray[np.int64]:
+    """Return the number (rows,) of the group of each row, from its names, places or numbers (rows,) or (rows, k).
+
+    Example:
+        >>> group_numbers(["b", "a", "b"]).tolist()
+        [1, 0, 1]
+    """
+    return np.asarray(np.unique(np.asarray(group), return_inverse=True, axis=0)[1])
+
+
+def resampled_median(values: ArrayLike, number: NDArray[np.int64]) -> Statistic:
+    """Return the median of values (rows,) or (rows, k) as a statistic of groups, whose numbers are those of the rows.
+
+    The search is in two steps, first over blocks of ordered values, so that a sample takes the square root of their number.
+
+    Example:
+        >>> resampled_median([3.0, 1.0, 2.0], np.array([0, 0, 1]))(np.array([[1.0, 1.0], [1.0, 3.0]])).tolist()
+        [2.0, 2.0]
+    """
+    array = np.asarray(values, dtype=float)
+    order = np.argsort(array, axis=None)
+    ordered, of_value = array.ravel()[order], number[order // (array.size // len(array))]
+    n_groups, size = int(number.max()) + 1, math.isqrt(len(ordered) - 1) + 1
+    filled = np.full(size * -(-len(ordered) // size), n_groups)  # filled up with a group that no sample contains
+    filled[: len(ordered)] = of_value
+    blocks = filled.reshape(-1, size)
+    at = blocks + (n_groups + 1) * np.arange(len(blocks))[:, None]
+    in_block = np.bincount(at.ravel(), minlength=len(blocks) * (n_groups + 1)).reshape(len(blocks), -1)[:, :-1]
+
+    def of(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        up_to = (times @ in_block.T).cumsum(axis=1)  # values of a sample up to the end of each block
+        padded, n = np.pad(times, ((0, 0), (0, 1))), up_to[:, -1]
+
+        def value(rank: NDArray[np.float64]) -> NDArray[np.float64]:
+            block = (up_to <= rank[:, None]).sum(axis=1)
+            before = np.take_along_axis(np.pad(up_to, ((0, 0), (1, 0))), block[:, None], axis=1)
+            within = before + np.take_along_axis(padded, blocks[block], axis=1).cumsum(axis=1)
+            found: NDArray[np.float64] = ordered[block * size + (within <= rank[:, None]).sum(axis=1)]
+            return found
+
+        return (value((n - 1) // 2) + value(n // 2)) / 2
+
+    return of
+
+
+def bootstrap_interval(statistic: Statistic, number: NDArray[np.int64], n: int = 1000) -> tuple[float, float]:
     """Return the 95 % interval of a statistic of rows, by a bootstrap over groups of rows that are not independent.
 
     Args:
-        statistic: Function of row numbers (k,), ascending, which may repeat.
-        group: Group of each row, e.g. its place, (rows,) or (rows, k).
+        statistic: Function of the numbers of times (samples, groups) that samples contain each group, e.g.
+            `resampled_median`.
+        number: Number of the group of each row, (rows,); see `group_numbers`.
         n: Number of bootstrap samples.
 
     Example:
-        >>> error, place = np.array([1.0, 1.0, 1.0, 4.0, 4.0, 4.0]), [0, 0, 0, 1, 1, 1]
-        >>> bootstrap_interval(lambda rows: float(np.median(error[rows])), place)
+        >>> error, place = np.array([1.0, 1.0, 1.0, 4.0, 4.0, 4.0]), np.array([0, 0, 0, 1, 1, 1])
+        >>> bootstrap_interval(resampled_median(error, place), place)
         (1.0, 4.0)
     """
-    number = np.unique(np.asarray(group), return_inverse=True, axis=0)[1]
     n_groups, draw, values = int(number.max()) + 1, np.random.default_rng(0), []
-    for _ in range(n):
-        times = np.bincount(draw.integers(n_groups, size=n_groups), minlength=n_groups)
-        values.append(statistic(np.repeat(np.arange(len(number)), times[number])))
-    low, high = np.percentile(values, (2.5, 97.5)).tolist()
+    batch = max(1, MAX_DRAWN // n_groups)
+    for start in range(0, n, batch):
+        size = min(batch, n - start)
+        drawn = draw.integers(n_groups, size=(size, n_groups)) + n_groups * np.arange(size)[:, None]
+        times = np.bincount(drawn.ravel(), minlength=size * n_groups).reshape(size, n_groups)
+        values.append(statistic(times.astype(float)))
+    low, high = np.percentile(np.concatenate(values), (2.5, 97.5)).tolist()
     return low, high
 
 
@@ -85,10 +136,10 @@ def summary(errors: ArrayLike, group: ArrayLike | None = None) -> ErrorSummary:
         return ErrorSummary(median=nan, p90=nan, mean=nan, low=nan, high=nan, n=0)
     low, high = median_interval(values)
     group = None if group is None else np.asarray(group)[finite]
-    if group is not None and (n_groups := len(np.unique(group, axis=0))) < len(values):
+    if group is not None and (n_groups := int((number := group_numbers(group)).max()) + 1) < len(values):
         low, high = float(values.min()), float(values.max())
         if n_groups > 1:
-            low, high = bootstrap_interval(lambda rows: float(np.median(values[rows])), group)
+            low, high = bootstrap_interval(resampled_median(values, number), number)
     return {
         "median": float(np.median(values)),
         "p90": float(np.percentile(values, 90)),
@@ -130,12 +181,14 @@ def paired_change(
     """
     first, second = np.asarray(before, dtype=float), np.asarray(after, dtype=float)
 
-    def change(rows: NDArray[np.int64]) -> float:
-        return float(np.median(second[rows]) / max(np.median(first[rows]), least_deg) - 1)
+    def change(medians: NDArray[np.float64]) -> Any:
+        return medians[1] / np.maximum(medians[0], least_deg) - 1
 
-    every = np.arange(len(first))
-    low, high = bootstrap_interval(change, every if group is None else group, n)
-    return {"median_deg": float(np.median(second)), "change": change(every), "low": low, "high": high}
+    number = np.arange(len(first)) if group is None else group_numbers(group)
+    both = [resampled_median(errors, number) for errors in (first, second)]
+    low, high = bootstrap_interval(lambda times: change(np.stack([of(times) for of in both])), number, n)
+    medians = np.array([np.median(first), np.median(second)])
+    return {"median_deg": float(medians[1]), "change": float(change(medians)), "low": low, "high": high}
 
 
 def paired_difference(errors: DataFrame, method: str, other: str, min_groups: int = 10) -> tuple[float, float, float]:
@@ -154,10 +207,11 @@ def paired_difference(errors: DataFrame, method: str, other: str, min_groups: in
     """
     level = "place" if "place" in errors.index.names else "index"
     found = (errors[method] - errors[other]).dropna()
-    group, values = found.index.get_level_values(level), found.to_numpy()
+    number = group_numbers(found.index.get_level_values(level))
     low = high = math.nan
-    if group.nunique() >= min_groups:
-        low, high = bootstrap_interval(lambda rows: float(values[rows].mean()), group)
+    if len(found) and number.max() + 1 >= min_groups:
+        rows, total = np.bincount(number), np.bincount(number, weights=found)
+        low, high = bootstrap_interval(lambda times: times @ total / (times @ rows), number)
     return float(found.mean()), low, high
 
 

@@ -95,7 +95,7 @@ class PosteriorLocalizer(Localizer):
         parts = []
         for rows in rssi.split(BATCH_ROWS):
             posterior = self.locator.locate(rows)
-            radius = torch.stack([posterior.credible_radius(level) for level in LEVELS], dim=1)
+            radius = posterior.credible_radii(LEVELS)
             parts.append((posterior.median, radius, posterior.ambiguous, posterior.floor_probability.amax(dim=1)))
         found = Located(*(torch.cat(values) for values in zip(*parts, strict=True)))
         return found if self.locator.region.floors else replace(found, floor_probability=None)

@@ -65,7 +65,7 @@ class StationsPosterior(StationLocalizer):
         parts = []
         for rows in torch.arange(len(data)).split(BATCH_TRANSMISSIONS):
             posterior = self.locator.locate(data.subset(rows))
-            radius = torch.stack([posterior.credible_radius(level) for level in LEVELS], dim=1)
+            radius = posterior.credible_radii(LEVELS)
             direction = torch.stack([self.locator.direction(posterior, name) for name in data.names], dim=1)
             parts.append((posterior.median, radius, posterior.ambiguous, direction))
         position, radius, ambiguous, direction = (torch.cat(values) for values in zip(*parts, strict=True))

@@ -83,6 +83,23 @@ def test_the_mass_of_a_one_dimensional_posterior_is_right():
     assert not posterior.ambiguous[0]
 
 
+@pytest.mark.parametrize("shared", [True, False])
+def test_radii_of_several_levels_contain_the_mass_around_the_median(generator, shared):
+    at = 9 * torch.rand(1 if shared else 3, 200, 3, generator=generator, dtype=torch.float64)
+    mass = normalised(2 * torch.randn(3, 200, generator=generator, dtype=torch.float64))
+    found = Posterior(at, mass, 0.2, inflation=1.5)
+    levels = (0.1, 0.5, 0.95)
+    radii = found.credible_radii(levels).numpy()
+    for row, (point, weight) in enumerate(zip(at.expand(3, -1, -1).numpy(), mass.exp().numpy(), strict=True)):
+        median = found.median[row].numpy()
+        away = np.linalg.norm(point - median, axis=1)
+        assert abs((weight[:, None] * (point - median) / away[:, None]).sum(axis=0)).max() < 0.02  # that of Weiszfeld
+        expected = [min(r for r in away if weight[away <= r].sum() >= level) for level in levels]
+        np.testing.assert_allclose(radii[row], 1.5 * (np.array(expected) + 0.05))
+    for number, level in enumerate(levels):
+        assert found.credible_radius(level).tolist() == radii[:, number].tolist()
+
+
 def test_two_modes_are_ambiguous():
     one, two = gaussian_on_a_line(-3, 0.2), gaussian_on_a_line(3, 0.2)
     weight = torch.logaddexp(one.log_weight + math.log(0.6), two.log_weight + math.log(0.4))

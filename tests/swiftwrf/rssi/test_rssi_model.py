@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -18,10 +19,12 @@ from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.data.splits import folds
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
+from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
-from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, log_distance
+from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
-from swiftwrf.rssi.training import Bins, RssiTraining
+from swiftwrf.rssi.training import Bins, RssiTraining, choose_residual_kernels, rough_candidates
+from swiftwrf.runtime.digest import computed_once
 
 KERNEL = Kernel(4.0, 1.0, matern12_weight=0.6, noise=1.0)
 FIELD_DB, NOISE_DB, PATH_LOSS_STD_DB = 3.0, 2.0, 30.0
@@ -395,3 +398,75 @@ def test_path_loss_model_of_a_receiver_detected_at_one_distance():
     assert (found.level.item(), found.slope.item()) == (-52.0, 0.0)
     other = PathLoss(torch.tensor([-40.0]), torch.tensor([-20.0]))
     assert found.where(torch.tensor([False]), other) == other
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1, 0.7], ids=["complete", "few empty", "most empty"])
+def test_the_kernel_has_the_lowest_error_of_processes_without_each_fold(generator, missing):
+    n, noises = 60, (0.1, 1.0)
+    position = 20 * torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    scale = 1 + torch.rand(n, generator=generator, dtype=torch.float64)
+    compared = rough_candidates(position, noises)
+    true = compared[2](position, position) + 0.1 * scale.diag()
+    residual = (torch.linalg.cholesky(true) @ torch.randn(n, 8, generator=generator).double()).reshape(n, 4, 2)
+    residual[torch.rand(n, 4, generator=generator) < missing] = torch.nan
+    fold = torch.arange(n) % 5
+    score = []
+    for kernel in compared:
+        covariance = (kernel(position, position) + kernel.noise * scale.diag()).numpy()
+        errors = []
+        for column in residual.unbind(dim=1):
+            detected = ~column[:, 0].isnan()
+            for number in range(5):
+                out, kept = ((each & detected).numpy() for each in (fold == number, fold != number))
+                weight = np.linalg.solve(covariance[kept][:, kept], covariance[kept][:, out]).T
+                errors.append(column.numpy()[out] - weight @ column.numpy()[kept])
+        score.append(np.abs(np.concatenate(errors)).mean(axis=0))
+    bins = SimpleNamespace(position=position, fold=fold, noise_scale=scale)
+    chosen = choose_residual_kernels(bins, residual, noises, least_noise=(0.0, 0.5))
+    allowed = [kernel.noise >= 0.5 for kernel in compared]
+    lowest = [np.array(score)[:, 0].argmin(), np.where(allowed, np.array(score)[:, 1], np.inf).argmin()]
+    assert [kernel for kernel, _ in chosen] == [compared[number] for number in lowest]
+    without = residual.abs().flatten(0, 1).nanmean(dim=0).tolist()
+    assert [has_field for _, has_field in chosen] == [score[n][k] < without[k] for k, n in enumerate(lowest)]
+
+
+@pytest.mark.parametrize("varied", ["nothing", "shift", "floors"])
+def test_rows_at_one_position_count_as_each_alone(generator, varied):
+    room = rssi_room(n=30)
+    position = room.transmitter_position.repeat(4, 1)
+    rssi = room.rssi_dbm.repeat(4, 1) + 3 * torch.randn(120, 12, generator=generator, dtype=torch.float64)
+    rssi[rssi < -70] = torch.nan
+    shift, crossed = torch.zeros_like(rssi), torch.zeros_like(rssi)
+    different = torch.arange(120)[:, None] % 7 * torch.ones(12).double()
+    shift, crossed = shift + different * (varied == "shift"), crossed + different * (varied == "floors")
+    curve = Detection(
+        rssi[~rssi.isnan()].min().repeat(12), 1.0, torch.full((12,), 0.02).double(), torch.ones(12).bool()
+    )
+    rows = room.receiver_position, rssi, "weak", shift, curve, crossed
+    together = fit_path_losses(position, *rows)
+    nearby = position + 1e-9 * torch.arange(120)[:, None]  # every row at a position of its own
+    alone = fit_path_losses(nearby, *rows)
+    for own, other in ((together.each, alone.each), (together.shared, alone.shared)):
+        torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-6)
+    torch.testing.assert_close(together.variance, alone.variance, atol=1e-5, rtol=1e-6)
+
+
+def test_predictors_of_the_same_rows_estimate_the_curve_of_detection_once():
+    data = rssi_room(n=60)
+    with_empty = data.derived(rssi_dbm=data.rssi_dbm.where(data.rssi_dbm > -65, torch.nan))
+    asked = []
+
+    def curve(position, rssi):
+        asked.append(rssi)
+        return Detection.estimate(position, rssi)
+
+    with mock.patch("swiftwrf.rssi.base._detection_curve", computed_once(curve)):
+        first, second = (RSSI_PREDICTORS[name]().fit(with_empty) for name in ("mean", "mri_receiver"))
+        assert len(asked) == 1
+        assert torch.equal(first.detection.limit, second.detection.limit)
+        changed = with_empty.rssi_dbm.clone()
+        changed[0, ~changed[0].isnan()] -= 1
+        other = RSSI_PREDICTORS["mean"]().fit(with_empty.derived(rssi_dbm=changed))
+    assert len(asked) == 2
+    expected = Detection.estimate(data.transmitter_position, changed)
+    assert torch.equal(other.detection.limit, expected.limit)

@@ -223,9 +223,10 @@ def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
     )
     known = np.arange(20).reshape(1, 4, 5) % 3 == 0
     detection = np.where(np.arange(5) < 2, 0.4, 0.6) * np.ones((1, 1, 4, 5))
-    run = made_run(tmp_path, known=known, detection=detection)
+    width = np.where(np.arange(5) < 4, 7.0, 8.5) * np.ones((1, 1, 4, 5))
+    run = made_run(tmp_path, known=known, detection=detection, width=width)
     plots = [Maps(run).summary(), *(Maps(run).by_receiver(kind) for kind in ("predicted", "width"))]
-    assert [pattern for pattern, _ in hatched] == ["////", "\\\\\\\\"] * 3
+    assert [pattern for pattern, _ in hatched] == ["////", "\\\\\\\\"] * 4
     for pattern, where in hatched:
         np.testing.assert_array_equal(where, ~known[0] if pattern == "////" else detection[0, 0] < 0.5)
     for plot in plots:
@@ -233,6 +234,22 @@ def test_cells_that_are_not_measured_are_hatched(tmp_path, monkeypatch):
         assert plot.data["measured"].tolist() == known.ravel().tolist()
     run.metrics["coverage"][0]["reach_m"] = None
     assert "Hatched like /: not measured, outside the scans; like" in Maps(run).summary().caption
+
+
+def test_widths_are_drawn_at_receivers_where_they_vary(tmp_path):
+    width = np.full((1, 3, 4, 5), 10.0)
+    width[0, 0, 0, 0], width[0, 2, 1, 2] = 11.9, 12.1  # 1.2 times the median is drawn
+    level = np.full((1, 3, 4, 5), -60.0)
+    names, measured = np.array(["a", "b", "c"]), np.full((4, 3), -60.0)
+    run = made_run(
+        tmp_path, predicted=level, width=width, detection=0 * level + 1, receiver_names=names, measured=measured
+    )
+    plot = Maps(run).by_receiver("width")
+    assert [panel.axes[0].get_title() for panel in plot.panels] == ["c"]
+    assert set(plot.data["receiver"]) == {"c"}
+    run.maps["width"] = width.clip(max=11.9)
+    assert Maps(run).by_receiver("width") is None
+    assert len(Maps(run).by_receiver("predicted").panels) == 3
 
 
 def test_the_mean_is_recommended_where_the_model_is_behind_it_on_held_out_rows(rssi_run):
