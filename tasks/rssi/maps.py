@@ -173,19 +173,9 @@ class Maps:
         ax.plot(*a["measured_position"][:, :2].T, ".", color="#000001", markersize=1.2, rasterized=many, zorder=2)
         self._mark_receivers(ax, None)
         style = {"fontsize": 8, "color": "#000001", "ha": "center", "va": "center", "zorder": 5}
+        style["bbox"] = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "linewidth": 0.6}
         for rank, spot in enumerate(self.spots[:MAX_SPOTS], start=1):
-            box: dict[str, Any] = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "linewidth": 0.6}
-            ax.text(
-                spot["x_m"],
-                spot["y_m"],
-                str(rank),
-                fontsize=8,
-                color="#000001",
-                bbox=box,
-                ha="center",
-                va="center",
-                zorder=5,
-            )
+            ax.text(spot["x_m"], spot["y_m"], str(rank), **style)
         shares = {name: self.coverage[name.replace(" ", "_")] for name in reversed(CLASSES)}
         patches = [
             Patch(color=COVERAGE[name], label=name if share is None or name == CLASSES[0] else f"{name} {share:.0%}")

@@ -64,7 +64,7 @@ def page(runs: list[Records]) -> Page:
     if any(run.arrays(RECEIVERS) for run in runs):
         sections.insert(-1, sections_of("Where the receivers are", runs, receivers_section))
     if any(run.arrays(SUGGESTED) for run in runs):
-        sections[-2].parts.append(sections_of("Where to measure next", runs, _suggestion))
+        sections[0].parts.append(sections_of("Where to measure next", runs, _suggestion))
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
         sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
