@@ -30,7 +30,7 @@ from torch.nn import functional
 
 from swiftwrf import Rssi, RssiModel, load_rssi, rssi_room
 from swiftwrf.contrib.survey import receivers as receivers_module
-from swiftwrf.contrib.survey.plan import SPREAD_DB, interval, plan_coverage
+from swiftwrf.contrib.survey.plan import interval, plan_coverage
 from swiftwrf.contrib.survey.receivers import SharedPathLoss, locate_receivers
 from swiftwrf.data import simulated
 from swiftwrf.locate.posterior import pooled_weights
@@ -240,7 +240,7 @@ def predict_left_out(data: Rssi) -> Row:
     threshold = float(data.rssi_dbm[data.detected].quantile(0.5)) if int(data.detected.sum()) < 10**7 else -70.0
     for out in range(len(data.receiver_names)):
         others = [column for column in range(len(data.receiver_names)) if column != out]
-        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others], SPREAD_DB)
+        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others])
         seen = data.detected[:, out]
         distance = log_distance(data.transmitter_position[seen], data.receiver_position[out][None])[:, 0]
         mean, std = shared.predict(distance)
