@@ -143,7 +143,7 @@ def locate_receivers(
         n_cells: Number of candidate positions, before the most probable ones are refined.
         margin: Width of the band around the rows where receivers may be, relative to the extent of the rows.
         weight: Weight of the likelihood, above 0. Defaults to that of the known receivers, or to 0.6, which maximises the
-            density at the true positions of 58 receivers of 8 surveys (`benchmarks/receivers.py`).
+            density at the true positions of 58 receivers of 8 surveys (`benchmarks/survey.py receivers`).
 
     Raises:
         InputError: Receivers that move, or no receiver of unknown position with enough rows.
