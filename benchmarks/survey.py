@@ -178,7 +178,8 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
 
     def above(power: Tensor) -> Tensor:  # of packets on a random channel, (n, r)
         z = (POWER_DBM + power - threshold) / PACKET_STD_DB
-        return (1 - MISSED) * torch.special.ndtr(z).mean(dim=2)
+        detected: Tensor = (1 - MISSED) * torch.special.ndtr(z).mean(dim=2)
+        return detected
 
     missing = (1 - above(existing + gain[:, None])).prod(dim=1)
     before = 1 - float(missing.mean())
