@@ -156,6 +156,21 @@ def survey_plan() -> str:
     return markdown(["place", "regret of coverage, mean [points]", "of single floors"], rows)
 
 
+def survey_gains() -> str:
+    """Return predicted and true gains of coverage on simulated floors."""
+    floors = load("survey_plan").get("floors", [])
+    rows = []
+    for what, *names in (
+        ("chosen place", "predicted_gain", "true_gain", "true_gain_like_surveyed"),
+        ("all places", "predicted_gain_of_all", "true_gain_of_all", None),
+    ):
+        rows.append([what, *(f"{100 * mean(floor[name] for floor in floors):.1f}" if name else "" for name in names)])
+    hold = f"{mean(floor['intervals_hold'] for floor in floors):.0%}"
+    rows.append(["80 % intervals that hold", hold, "", ""])
+    power = "true, with the mean power of the surveyed ones"
+    return markdown(["gain of coverage [points]", "predicted", "true", power], rows)
+
+
 def survey_left_out() -> str:
     """Return errors of RSSI that is predicted at a receiver from the path loss of all others."""
     rows = [

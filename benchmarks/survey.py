@@ -7,8 +7,9 @@ python benchmarks/survey.py plan --data DATA
 other campaigns (tetam, kolak, lora, wifi-rooms, the built-in floor), so no set chooses its own.
 
 `plan`: on ten simulated floors with random boxes and four receivers, the true coverage of a fifth one at 20 places is
-computed. The regret of a place is the best true coverage less its own. On measured sets each receiver is left out, and its
-RSSI is predicted by the path loss of all others at its known position.
+computed. The regret of a place is the best true coverage less its own, with a fifth one of mean power. Gains of coverage are
+those of an access point whose power varies like that of the surveyed ones. On measured sets each receiver is left out, and
+its RSSI is predicted by the path loss of all others at its known position.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from torch.nn import functional
 
 from swiftwrf import Rssi, RssiModel, load_rssi, rssi_room
 from swiftwrf.contrib.survey import receivers as receivers_module
-from swiftwrf.contrib.survey.plan import SPREAD_DB, interval, plan_coverage
+from swiftwrf.contrib.survey.plan import interval, plan_coverage
 from swiftwrf.contrib.survey.receivers import SharedPathLoss, locate_receivers
 from swiftwrf.data import simulated
 from swiftwrf.locate.posterior import pooled_weights
@@ -49,7 +50,8 @@ CAMPAIGNS = {
 LEFT_OUT = tuple(name for name in CAMPAIGNS if name != "lora-campus")  # sets with four receivers or more
 RECEIVERS_RESULT, PLAN_RESULT = "survey_receivers", "survey_plan"
 FLOORS = 10
-POWER_DBM, PACKET_STD_DB, MISSED = -8.0, 2.0, 0.1  # of the simulated floors, as of `rssi_room`
+# of the simulated floors, as of `rssi_room`
+POWER_DBM, PACKET_STD_DB, MISSED, GAIN_STD_DB = -8.0, 2.0, 0.1, 2.0
 Row = dict[str, Any]
 
 
@@ -165,7 +167,7 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
             torch.stack([simulated._power(at, one) for one in of], dim=1)
             for at, of in ((rows, receiver), (cells, receiver), (cells, places))
         )
-    gain = 2.0 * torch.randn(n_receivers, dtype=torch.float64, generator=generator)
+    gain = GAIN_STD_DB * torch.randn(n_receivers, dtype=torch.float64, generator=generator)
     channel = torch.randint(3, (n_rows, n_receivers, 1), generator=generator)
     noise = PACKET_STD_DB * torch.randn(n_rows, n_receivers, dtype=torch.float64, generator=generator)
     rssi = (POWER_DBM + gain + surveyed.gather(2, channel)[..., 0] + noise).round()
@@ -176,11 +178,18 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
 
     def above(power: Tensor) -> Tensor:  # of packets on a random channel, (n, r)
         z = (POWER_DBM + power - threshold) / PACKET_STD_DB
-        return (1 - MISSED) * torch.special.ndtr(z).mean(dim=2)
+        detected: Tensor = (1 - MISSED) * torch.special.ndtr(z).mean(dim=2)
+        return detected
 
     missing = (1 - above(existing + gain[:, None])).prod(dim=1)
-    true = 1 - (missing[:, None] * (1 - above(further))).mean(dim=0)
     before = 1 - float(missing.mean())
+
+    def coverage(gain_db: Tensor | float) -> Tensor:  # of each place, (m,)
+        return 1 - (missing[:, None] * (1 - above(further + gain_db))).mean(dim=0)
+
+    true = coverage(0.0)
+    own = GAIN_STD_DB * torch.randn(len(places), 1, dtype=torch.float64, generator=generator)
+    true_gain = coverage(own) - before
     found = plan_coverage(RssiModel().fit(survey), survey, 1, above_dbm=threshold, candidates=places)
     mean, start, end = interval(found.gain)
     chosen, hole = found.chosen[0], hole_centre(found.cells, found.probability[0], places)
@@ -194,7 +203,11 @@ def measure_floor(seed: int, n_rows: int = 300, n_receivers: int = 4) -> Row:
         "hole": float(true[hole]),
         "predicted_gain": float(mean[chosen]),
         "true_gain": float(true[chosen]) - before,
-        "intervals_hold": float(((true - before >= start) & (true - before <= end)).double().mean()),
+        "true_gain_like_surveyed": float(coverage(gain.mean())[chosen]) - before,
+        "surveyed_gain_db": float(gain.mean()),
+        "predicted_gain_of_all": float(mean.mean()),
+        "true_gain_of_all": float(true.mean()) - before,
+        "intervals_hold": float(((true_gain >= start) & (true_gain <= end)).double().mean()),
     }
     print(seed, {name: round(value, 3) for name, value in row.items()}, flush=True)
     return row
@@ -228,7 +241,7 @@ def predict_left_out(data: Rssi) -> Row:
     threshold = float(data.rssi_dbm[data.detected].quantile(0.5)) if int(data.detected.sum()) < 10**7 else -70.0
     for out in range(len(data.receiver_names)):
         others = [column for column in range(len(data.receiver_names)) if column != out]
-        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others], SPREAD_DB)
+        shared = SharedPathLoss.fit(data.columns(others), data.receiver_position[others])
         seen = data.detected[:, out]
         distance = log_distance(data.transmitter_position[seen], data.receiver_position[out][None])[:, 0]
         mean, std = shared.predict(distance)

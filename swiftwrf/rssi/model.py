@@ -222,11 +222,25 @@ class RssiModel(RssiPredictor, Saved):
         return model
 
     @single_thread()
-    def _predict(self, position: Tensor) -> tuple[Tensor, Tensor]:
+    def _predict(self, position: Tensor, max_alone: float = 1.5) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of RSSI at positions.
+
+        Where empty cells are no sign of a weak signal and rows have `max_alone` values or fewer on average, e.g. that of the
+        associated receiver, the field of a receiver is known where it was measured itself. Not studied.
+        """
         offset, posterior = position - self.centre, self.posterior
         mean = posterior.at(offset, self.kernel(offset.float(), posterior.position.float()))[0]
-        prior_db = self.field_db, self.noise_db
-        std = predictive_std(posterior.trend, posterior.receiver, offset, prior_db, self.covariance)
+        is_alone = self.detection is None and float(posterior.measured.sum(dim=0).mean()) <= max_alone
+        processes = posterior.own_trends if is_alone else [posterior.trend]
+        of_receivers = posterior.receiver, self.field_db, self.noise_db, self.covariance
+        parts = zip(processes, *(values.tensor_split(len(processes)) for values in of_receivers), strict=True)
+        std = torch.cat(
+            [
+                predictive_std(process, receiver, offset, (field_db, noise_db), covariance)
+                for process, receiver, field_db, noise_db, covariance in parts
+            ],
+            dim=1,
+        )
         return mean.float(), std.float()
 
     @checked

@@ -326,6 +326,12 @@ class RssiPosterior:
         return trend_process(self.kernel, self.position, self.receiver)
 
     @cached_property
+    def own_trends(self) -> list[GaussianProcess]:
+        """Process of each receiver of the positions where it was measured; see `trend`."""
+        work = zip(self.measured, self.receiver[:, None], strict=True)
+        return [trend_process(self.kernel, self.position[seen > 0], receiver) for seen, receiver in work]
+
+    @cached_property
     def coefficient(self) -> Tensor:
         """Coefficients of the kernel to the rows whose sum is the latent field, float64 (n, R) [dB]."""
         return (self.field_db[:, None] * self.tangent * self.dual).T.contiguous()

@@ -43,9 +43,6 @@ N_CELLS = 800  # of the measured area, on all floors together
 N_CANDIDATES = 150  # places that are compared if none are given
 N_SAMPLES = 60  # of the maps
 HEIGHT_M = 1.0  # of a candidate above the scans if no receiver has a known position
-# prior standard deviation of level and slope between access points. 80 % intervals of the gain on 24 simulated floors, and
-# of receivers that are left out of measured sets, hold 94 and 76 % with 2 dB, and 99 and 87 % with 6 dB
-SPREAD_DB = 3.0
 WORTH = 0.02  # gain of coverage below which a further access point is not worth it
 
 
@@ -249,7 +246,7 @@ class _Area:
             )
         rows = survey if model.attenuation is None else model.attenuation.removed(survey)
         known = receiver.isfinite().all(dim=1).nonzero()[:, 0].tolist()
-        shared = SharedPathLoss.fit(rows.columns(known), receiver[known], SPREAD_DB)
+        shared = SharedPathLoss.fit(rows.columns(known), receiver[known])
         floors = survey.floors
         heights: Sequence[float | None] = [None] if floors is None else floors.height_m
         at = survey.transmitter_position

@@ -143,7 +143,7 @@ def locate_receivers(
         n_cells: Number of candidate positions, before the most probable ones are refined.
         margin: Width of the band around the rows where receivers may be, relative to the extent of the rows.
         weight: Weight of the likelihood, above 0. Defaults to that of the known receivers, or to 0.6, which maximises the
-            density at the true positions of 58 receivers of 8 surveys (`benchmarks/receivers.py`).
+            density at the true positions of 58 receivers of 8 surveys (`benchmarks/survey.py receivers`).
 
     Raises:
         InputError: Receivers that move, or no receiver of unknown position with enough rows.
@@ -238,7 +238,7 @@ class SharedPathLoss:
         cls,
         data: Rssi,
         receiver: Tensor,
-        spread_db: float = 6.0,
+        spread_db: float = 3.0,
         noises: tuple[float, ...] = (0.3, 1.0, 2.0, 3.0),
     ) -> SharedPathLoss:
         """Fit the shared path loss and the kernel with receivers at given positions (R, 3) [m].
@@ -246,7 +246,9 @@ class SharedPathLoss:
         Args:
             data: Rows.
             receiver: Positions of the receivers, of which most are estimates.
-            spread_db: Prior standard deviation of `fit_path_losses`.
+            spread_db: Prior standard deviation of `fit_path_losses`. With 6 dB the mean error of 72 positions on six
+                simulated floors is 0.92 m for 0.86 m. 80 % intervals of the coverage of a further receiver on 18 floors hold
+                85 % with 2 dB and 88 % with 3 dB, and those of receivers that are left out of measured sets 76 % with 2 dB.
             noises: Compared variances of a measurement relative to that of the field. Smaller ones explain errors of the
                 positions by the field: with 0.03 and 0.1, too, the weight of the likelihood is 0.45 for 0.67, and 80 %
                 regions hold 56 of 58 receivers for 53 (`benchmarks/survey.py receivers`).

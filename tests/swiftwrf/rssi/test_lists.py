@@ -39,6 +39,20 @@ def test_the_map_of_a_receiver_that_is_not_listed_is_nearer_to_the_truth(number,
     assert number == 1 or error["auto"] < 0.9 * error["weak"]
 
 
+def test_a_receiver_is_uncertain_where_another_one_was_associated():
+    """The standard deviation is that of kriging with the receiver's own rows, in plain NumPy; the path loss is certain."""
+    data = strongest(1, hysteresis_db=4.0)
+    model = RssiModel().fit(data)
+    model.covariance = torch.zeros_like(model.covariance)
+    at, std = data.transmitter_position[:50], model.predict(data.transmitter_position[:50]).std
+    for number, seen in enumerate(data.detected.T):
+        own = data.transmitter_position[seen]
+        cross = model.kernel(at, own).numpy()
+        explained = (cross * np.linalg.solve(model.kernel.covariance(own).numpy(), cross.T).T).sum(axis=1)
+        variance = float(model.noise_db[number]) ** 2 + float(model.field_db[number]) ** 2 * (1 - explained)
+        np.testing.assert_allclose(std[:, number], np.sqrt(variance), rtol=0.02)
+
+
 def packets(order: str) -> tuple[np.ndarray, np.ndarray]:
     """Return rows of one of three receivers along a line, in turn or by regions, and their positions."""
     row = np.arange(90)

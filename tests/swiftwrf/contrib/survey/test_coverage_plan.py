@@ -119,7 +119,7 @@ def test_a_further_access_point_has_the_path_loss_and_the_shadowing_of_the_surve
     data, place = shadowed_hall(lost), np.array([30.0, 10.0, 2.5])
     model = RssiModel().fit(data)
     found = plan_coverage(model, data, 1, above_dbm=-75, candidates=place[None], off=data.receiver_names)
-    shared = SharedPathLoss.fit(data, data.receiver_position, module.SPREAD_DB)
+    shared = SharedPathLoss.fit(data, data.receiver_position)
     assert shared.common_db > 2
     cells, draw = found.cells.numpy(), np.random.default_rng(0)
     residual = (
