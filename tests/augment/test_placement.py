@@ -1,5 +1,6 @@
 """Placement of a next array: poses on the walls, expected errors, and the truth in the simulated office."""
 
+from copy import copy
 from functools import partial
 
 import numpy as np
@@ -83,6 +84,16 @@ def test_the_gain_is_a_difference_of_medians_with_a_bootstrap_of_positions(locat
     rows = np.random.default_rng(0).integers(24, size=(4000, 24))
     drawn = middle(before[rows], axis=1) - middle(after[rows], axis=1)
     assert float(found.gain_std_m[0]) == pytest.approx(drawn.std(), rel=0.2)
+
+
+def test_a_next_array_is_like_the_one_with_the_largest_weights_and_modes_are_half_a_wavelength_wide(locator, office):
+    for number, name in enumerate(locator.stations):
+        one = copy(locator)
+        one.weight = torch.full_like(locator.weight, 0.1)
+        one.weight.view(len(locator.stations), -1)[number, 0] = 0.4
+        assert _most_weighted(one) == name
+    posterior = locator.locate(office[40:41])
+    assert posterior.mode_width_m == pytest.approx(299792458 / OFFICE.frequency_hz / 2)
 
 
 def test_samples_vary_as_held_out_phases(locator):
