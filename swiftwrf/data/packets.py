@@ -56,8 +56,9 @@ def rows_of_packets(
     if by := separate_radios(table, column, together):
         receiver = receiver.where(receiver == "", receiver + " " + text_of(table[by]))
         notes.append(f"names in column {column} are those of several radios, which column {by} separates")
-    plain = receiver.map(plain_receiver)
-    one = plain.map(dict(zip(plain[::-1], receiver[::-1], strict=True)))  # in the first spelling
+    spellings = {name: plain_receiver(name) for name in receiver.unique()}
+    first_of = {plain: name for name, plain in reversed(spellings.items())}
+    one = receiver.map({name: first_of[plain] for name, plain in spellings.items()})
     if len(others := receiver[one != receiver].unique()):
         notes.append(f"names count as those of one receiver that differ in case, separators or zeros: {listed(others)}")
     packets = keys.assign(receiver=one.to_numpy())

@@ -104,11 +104,12 @@ def unknown_ids(receiver: pd.Series) -> NDArray[np.bool_]:
         >>> unknown_ids(pd.Series(["0", "8585712"], name="eci")), unknown_ids(pd.Series(["0", "335"], name="pci"))
         (array([ True, False]), array([False, False]))
     """
-    name, text = plain_name(str(receiver.name)), text_of(receiver).str.lower().str.removesuffix(".0")
+    name, (number, ids) = plain_name(str(receiver.name)), pd.factorize(text_of(receiver))
+    text = pd.Series(ids, dtype=str).str.lower().str.removesuffix(".0")
     unknown = text.map(plain_receiver).isin(NO_ADDRESS) | text.str.fullmatch(NO_CELL.pattern)
     if CELL_NUMBER.fullmatch(name) and not PHYSICAL_CELL.fullmatch(name):
         unknown |= text == "0"
-    mask: NDArray[np.bool_] = unknown.to_numpy(bool)
+    mask: NDArray[np.bool_] = unknown.to_numpy(bool)[number]
     return mask
 
 
