@@ -16,7 +16,6 @@ them together, so their order has no effect. Tangents and weights of the rows of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
