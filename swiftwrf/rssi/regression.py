@@ -201,16 +201,23 @@ def solve(
         place of limits, (n,) [dB]; the Cholesky factor of S, (n, n).
     """
     weight, latent, noise = torch.ones_like(value), torch.zeros_like(value), noise_db.square()
-    target, limit = value.masked_fill(weak, 0.0), value[weak]
-    site = value.new_zeros(2, len(limit))  # precision, and precision times value, in place of each limit
-    n_known = len(value) - len(limit)
-    step, last_change, vague = torch.ones_like(value), torch.zeros_like(value), 1e6  # variance without effect [dB^2]
+    limit, prior_variance = value[weak], (covariance.diagonal() + feature.square().sum(dim=1))[weak]
+    n_known, vague = len(value) - len(limit), 1e6  # variance of a limit without effect [dB^2]
+    step, last_change = torch.ones_like(value), torch.zeros_like(value)
+
+    def moments(mean: Tensor, variance: Tensor) -> Tensor:
+        return variance.new_zeros(2, 0) if censored is None else _site(mean, variance, limit, noise[weak], censored)
+
+    def replaced(site: Tensor) -> Tensor:
+        return value.masked_scatter(weak, (site[1] / site[0].clamp_min(1e-9)).where(site[0] > 1 / vague, 0.0))
+
+    site = moments(torch.zeros_like(limit), prior_variance)  # precision, and precision times value, in place of limits
     for _ in range(30):
         head, slope = (x[:, 0] for x in heads(latent[:, None]))
         variance = (noise / weight).masked_scatter(weak, 1 / site[0].clamp_min(1 / vague))
         total = covariance_of(covariance, (slope, feature), (slope, feature))
         total.diagonal().add_(variance)
-        factor, solved = torch.linalg.cholesky(total), target
+        factor, target = torch.linalg.cholesky(total), replaced(site)
         dual = torch.cholesky_solve((target + slope * latent - head)[:, None], factor)[:, 0]
         change = covariance @ (slope * dual) - latent
         # a change of the other sign: this latent value oscillates, because its head bends
@@ -223,14 +230,11 @@ def solve(
             # the last rows of S^-1 follow from those of its factor alone
             diagonal = torch.cholesky_inverse(factor[n_known:, n_known:]).diagonal()
             others = target[weak] - dual[weak] / diagonal, (1 / diagonal - variance[weak]).clamp_min(1e-6)
-            site = site + damping * (_site(*others, limit, noise[weak], censored) - site)
-            previous = target[weak]
-            now = (site[1] / site[0].clamp_min(1e-9)).where(site[0] > 1 / vague, 0.0)
-            target = target.masked_scatter(weak, now)
-            settled &= float(((now - previous) * site[0].sqrt()).abs().mean()) < 0.02
+            site = site + damping * (moments(*others) - site)
+            settled &= float(((replaced(site) - target)[weak] * site[0].sqrt()).abs().mean()) < 0.02
         if settled and float(change.abs().mean()) < 0.1:
             break
-    return dual, slope, variance, solved, factor
+    return dual, slope, variance, target, factor
 
 
 def _site(mean: Tensor, variance: Tensor, limit: Tensor, noise: Tensor, censored: tuple[float, float]) -> Tensor:
