@@ -150,13 +150,13 @@ def strongest_of_each(
     the standard deviation of their powers is larger than fading causes.
 
     Args:
-        packets: Place, time and name of each packet.
+        packets: Numbers of place and time, and of the name, of each packet.
         receiver: Column of the names in the table.
         power: Powers [dBm], nan where empty.
         timed: Whether the packets have times.
         min_spread_db: Least standard deviation of several radios [dB]. Not studied.
     """
-    group = packets.groupby(list(packets.columns), sort=False, dropna=False)
+    group = packets.groupby(list(packets.columns))
     if not NETWORK.fullmatch(plain_name(receiver)) or not (group.cumcount() > 0).any():
         return None
     values = pd.Series(power).groupby(group.ngroup().to_numpy())
