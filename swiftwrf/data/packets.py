@@ -61,7 +61,9 @@ def rows_of_packets(
     one = receiver.map({name: first_of[plain] for name, plain in spellings.items()})
     if len(others := receiver[one != receiver].unique()):
         notes.append(f"names count as those of one receiver that differ in case, separators or zeros: {listed(others)}")
-    packets = pd.DataFrame({"together": together, "receiver": pd.factorize(one)[0]})  # groups of numbers take less memory
+    packets = pd.DataFrame(
+        {"together": together, "receiver": pd.factorize(one)[0]}
+    )  # groups of numbers take less memory
     strongest = strongest_of_each(packets, column, power, timed)
     if strongest is not None:
         n = int((~strongest & named).sum())
