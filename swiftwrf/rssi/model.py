@@ -39,7 +39,7 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
-MAX_COMPARED = 24  # receivers with limits that both meanings of empty cells are compared at
+MAX_COMPARED = 12  # receivers with limits that both meanings are fitted to; more do not change the choice
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
