@@ -46,7 +46,7 @@ class Config:
     cases: Annotated[tuple[Case, ...], tyro.conf.Positional]
     """first: README's first command; one: rssi --rx 6; aoa: aoa --mix 0.3; packets: reading rows of a long table; map:
     fit_rssi on 2,000 rows of 100 receivers; receivers: rssi on them; scans: 1,000 scans located among 500 receivers; locate:
-    swiftwrf locate on a survey with a published split; workers: rssi on a cluster. Earlier results of other cases are kept"""
+    swiftwrf locate on a survey with a published split; workers: rssi on a cluster. Earlier results are kept"""
     against: Path | None = None
     """another checkout"""
     data: Path | None = None
