@@ -37,7 +37,7 @@ for rows in scans.split(125):
     found.median, [found.credible_radius(level) for level in (0.5, 0.8, 0.95)], found.ambiguous
 print(json.dumps({"seconds": time.perf_counter() - began[0], "processor": time.process_time() - began[1]}))
 """
-MAP = "import sys, swiftwrf; swiftwrf.fit_rssi(swiftwrf.load_rssi(sys.argv[1]))"
+MAP = "import sys, swiftwrf; print(swiftwrf.fit_rssi(swiftwrf.load_rssi(sys.argv[1])))"
 READ = "import sys, swiftwrf; print(len(swiftwrf.load_rssi(sys.argv[1])))"
 
 
