@@ -48,6 +48,7 @@ def surveys() -> str:
         "one": "`swiftwrf rssi --rx 6` on that floor",
         "aoa": "`swiftwrf aoa --mix 0.3` in the simulated room",
         "packets": "5 million packets are read",
+        "map": "a map of 100 receivers is fitted to 2,000 scans",
         "receivers": "`swiftwrf rssi` on 2,000 scans of 100 receivers",
         "scans": "1,000 scans are located among 500 receivers",
     }

@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 from record import ROOT, kept, options, write_result
 
-Case = Literal["first", "one", "aoa", "packets", "receivers", "scans", "locate", "workers"]
+Case = Literal["first", "one", "aoa", "packets", "map", "receivers", "scans", "locate", "workers"]
 GIB = 2**20  # in kibibytes
 N_WORKERS = (1, 2, 4)
 LOCATE = """
@@ -37,15 +37,16 @@ for rows in scans.split(125):
     found.median, [found.credible_radius(level) for level in (0.5, 0.8, 0.95)], found.ambiguous
 print(json.dumps({"seconds": time.perf_counter() - began[0], "processor": time.process_time() - began[1]}))
 """
+MAP = "import sys, swiftwrf; print(swiftwrf.fit_rssi(swiftwrf.load_rssi(sys.argv[1])))"
 READ = "import sys, swiftwrf; print(len(swiftwrf.load_rssi(sys.argv[1])))"
 
 
 @dataclass(frozen=True)
 class Config:
     cases: Annotated[tuple[Case, ...], tyro.conf.Positional]
-    """first: README's first command; one: rssi --rx 6; aoa: aoa --mix 0.3; packets: reading rows of a long table; receivers:
-    rssi on 2,000 rows of 100 receivers; scans: 1,000 scans located among 500 receivers; locate: swiftwrf locate on a survey
-    with a published split; workers: rssi on a cluster. Earlier results of other cases are kept"""
+    """first: README's first command; one: rssi --rx 6; aoa: aoa --mix 0.3; packets: reading rows of a long table; map:
+    fit_rssi on 2,000 rows of 100 receivers; receivers: rssi on them; scans: 1,000 scans located among 500 receivers; locate:
+    swiftwrf locate on a survey with a published split; workers: rssi on a cluster. Earlier results are kept"""
     against: Path | None = None
     """another checkout"""
     data: Path | None = None
@@ -83,6 +84,8 @@ def command(case: Case, folder: Path, config: Config) -> list[str]:
             return ["-m", "tasks", "aoa", "--mix", "0.3", "--processes", "1"]
         case "packets":
             return ["-c", READ, str(write_packets(folder / "survey.csv", config.n_packets))]
+        case "map":
+            return ["-c", MAP, str(write_survey(folder / "survey", 2000, 100))]
         case "receivers":
             return ["-m", "tasks", "rssi", "--rx", "all", "--data", str(write_survey(folder / "survey", 2000, 100))]
         case "scans":

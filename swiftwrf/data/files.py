@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -229,8 +230,10 @@ def _holds_values(cells: list[str]) -> bool:
 def table_of(source: object, text: str, header: bool = True) -> pd.DataFrame:
     """Return the table in the text of a CSV file, as `read_table`; messages begin with the source."""
     separator = _separator(text.split("\n", 1)[0])
+    shared = lru_cache(maxsize=2**16)(str)  # equal cells of neighbouring rows are one object in memory
     with refusing_broken(source, "a comma-separated table"):
-        lines = [line for line in csv.reader(io.StringIO(text, newline=""), delimiter=separator) if line]
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        lines = [list(map(shared, line)) for line in reader if line]
     if not lines:
         raise InputError(f"{source} is empty; expected a header and one row a measurement")
     first, end = [cell.strip() for cell in lines[0]], len(KRAKEN_LOG)

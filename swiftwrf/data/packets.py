@@ -56,11 +56,14 @@ def rows_of_packets(
     if by := separate_radios(table, column, together):
         receiver = receiver.where(receiver == "", receiver + " " + text_of(table[by]))
         notes.append(f"names in column {column} are those of several radios, which column {by} separates")
-    plain = receiver.map(plain_receiver)
-    one = plain.map(dict(zip(plain[::-1], receiver[::-1], strict=True)))  # in the first spelling
+    spellings = {name: plain_receiver(name) for name in receiver.unique()}
+    first_of = {plain: name for name, plain in reversed(spellings.items())}
+    one = receiver.map({name: first_of[plain] for name, plain in spellings.items()})
     if len(others := receiver[one != receiver].unique()):
         notes.append(f"names count as those of one receiver that differ in case, separators or zeros: {listed(others)}")
-    packets = keys.assign(receiver=one.to_numpy())
+    packets = pd.DataFrame(
+        {"together": together, "receiver": pd.factorize(one)[0]}
+    )  # groups of numbers take less memory
     strongest = strongest_of_each(packets, column, power, timed)
     if strongest is not None:
         n = int((~strongest & named).sum())
@@ -69,9 +72,8 @@ def rows_of_packets(
         )
         named &= strongest
     kept = named if n_listed > 1 else named | (receiver == "").to_numpy()
-    repeats = packets[kept].groupby(list(packets.columns), sort=False, dropna=False).cumcount()
-    keys["repeat"] = repeats.reindex(keys.index, fill_value=0)
-    row = keys.groupby(list(keys.columns), sort=False, dropna=False).ngroup().to_numpy()
+    repeats = packets[kept].groupby(["together", "receiver"]).cumcount().reindex(packets.index, fill_value=0)
+    row = packets.groupby(["together", repeats], sort=False).ngroup().to_numpy()
     number, names = pd.factorize(one[named])
     _, first = np.unique(row, return_index=True)
     if len(first) * len(names) > max_values:

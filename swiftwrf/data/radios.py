@@ -104,11 +104,12 @@ def unknown_ids(receiver: pd.Series) -> NDArray[np.bool_]:
         >>> unknown_ids(pd.Series(["0", "8585712"], name="eci")), unknown_ids(pd.Series(["0", "335"], name="pci"))
         (array([ True, False]), array([False, False]))
     """
-    name, text = plain_name(str(receiver.name)), text_of(receiver).str.lower().str.removesuffix(".0")
+    name, (number, ids) = plain_name(str(receiver.name)), pd.factorize(text_of(receiver))
+    text = pd.Series(ids, dtype=str).str.lower().str.removesuffix(".0")
     unknown = text.map(plain_receiver).isin(NO_ADDRESS) | text.str.fullmatch(NO_CELL.pattern)
     if CELL_NUMBER.fullmatch(name) and not PHYSICAL_CELL.fullmatch(name):
         unknown |= text == "0"
-    mask: NDArray[np.bool_] = unknown.to_numpy(bool)
+    mask: NDArray[np.bool_] = unknown.to_numpy(bool)[number]
     return mask
 
 
@@ -149,13 +150,13 @@ def strongest_of_each(
     the standard deviation of their powers is larger than fading causes.
 
     Args:
-        packets: Place, time and name of each packet.
+        packets: Numbers of place and time, and of the name, of each packet.
         receiver: Column of the names in the table.
         power: Powers [dBm], nan where empty.
         timed: Whether the packets have times.
         min_spread_db: Least standard deviation of several radios [dB]. Not studied.
     """
-    group = packets.groupby(list(packets.columns), sort=False, dropna=False)
+    group = packets.groupby(list(packets.columns))
     if not NETWORK.fullmatch(plain_name(receiver)) or not (group.cumcount() > 0).any():
         return None
     values = pd.Series(power).groupby(group.ngroup().to_numpy())

@@ -28,7 +28,8 @@ class RssiConfig(FieldConfig):
     """number of standard deviations of the noise beyond which an error counts linearly (Huber's constant: 95 % efficient
     for Gaussian noise), since packets have outliers"""
     max_locations: Annotated[int, Ge(10)] = 1500
-    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number"""
+    """location bins that the rows are averaged in; the time of a fit grows with the cube of their number. With 1,000
+    held-out errors are 6 % larger on gsm-recife and 0.2 % on kolak"""
     not_detected: NotDetected = "auto"
     """meaning of an empty cell.
 
@@ -36,7 +37,7 @@ class RssiConfig(FieldConfig):
     - "unknown": the cell is ignored.
     - "auto": if rows list the strongest or the associated receivers only (`Rssi.margin_db`), the power was below the listed
       ones. Otherwise "weak" at each receiver whose empty cells are where its path loss expects no value, else "unknown". It
-      is "unknown" at all receivers if values and detections in held-out folds are then more likely.
+      is "unknown" at all receivers if values and detections of 12 of them in held-out folds are then more likely.
 
     Only the path loss counts the empty cells of a receiver with fewer than 10 values"""
     calibration: Validation | None = None

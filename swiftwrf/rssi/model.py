@@ -9,7 +9,7 @@ directivity_r a few harmonics of the direction from the receiver.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
@@ -20,7 +20,7 @@ from torch import Tensor
 from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import each_fold, places
-from swiftwrf.gp import Kernel
+from swiftwrf.gp import Kernel, subsample
 from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
@@ -39,6 +39,7 @@ from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
 from swiftwrf.runtime.validation import checked
 
+MAX_COMPARED = 12  # receivers with limits that both meanings are fitted to; more do not change the choice
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
 
 
@@ -101,10 +102,17 @@ class RssiModel(RssiPredictor, Saved):
         of_lists = pool.margin_db is not None and config.not_detected == "auto"  # limits of rows, not of a receiver
         candidates = prepare(pool, columns_of(train.receiver_names, pool), config, shift, curve)
         parallel, candidates = parallel or _in_threads, candidates[: 1 if of_lists else None]
-        fit, *others = (fit_receivers(training, config, device, parallel, progress) for training in candidates)
+        every = some = torch.arange(len(train.receiver_names))
+        if len(candidates) > 1 and len(every) > MAX_COMPARED:
+            (some,) = subsample(candidates[0].limit.isfinite().any(dim=0).nonzero()[:, 0], rows=MAX_COMPARED)
+        rest = config, device, parallel, progress
+        fit, *others = (fit_receivers(training, some, {}, *rest) for training in candidates)
         for without_limits in others:  # as probable as values of a mean error that is 1 % lower
-            is_better = without_limits.score > fit.score + 0.01 * float(train.detected.sum())
+            is_better = without_limits.score > fit.score + 0.01 * float(fit.training.count.sum())
             fit = without_limits if is_better else fit
+        if len(some) < len(every):
+            chosen = candidates[fit.training.limit.isnan().all()]
+            fit = fit_receivers(chosen, every, fit.results, *rest)
         self.detection_field, training, rows = None, fit.training, fit.training.bin_of_row
         if not of_lists:
             self.detection, self.detection_field = training.path_loss.detection, fit.detection_field
@@ -307,6 +315,7 @@ class Fit(NamedTuple):
 
     Args:
         training: Training rows by location bin.
+        results: Results of `fit_receiver` by the number of the receiver.
         posterior: Arguments of `RssiPosterior` that depend on the receiver.
         covariance: Covariance of level and slope, (R, 2, 2).
         distance: log10 of the distances to the receivers, (n, R).
@@ -319,6 +328,7 @@ class Fit(NamedTuple):
     """
 
     training: RssiTraining
+    results: Mapping[int, dict[str, Tensor]]
     posterior: dict[str, Tensor]
     covariance: Tensor
     distance: Tensor
@@ -332,6 +342,8 @@ class Fit(NamedTuple):
 
 def fit_receivers(
     training: RssiTraining,
+    number: Tensor,
+    known: Mapping[int, dict[str, Tensor]],
     config: RssiConfig,
     device: torch.device,
     parallel: Map,
@@ -339,12 +351,14 @@ def fit_receivers(
     *,
     session_noise: float = 0.3,
 ) -> Fit:
-    """Fit all receivers and predict each bin by the other folds.
+    """Fit receivers and predict each bin by the other folds.
 
     The likelihood of the values is that of errors with a Laplace distribution, whose scale is the mean absolute error.
 
     Args:
         training: Training rows by location bin.
+        number: Numbers of the receivers, (R,).
+        known: Results of `fit_receiver` that are known, by the number of the receiver.
         config: Options.
         device: Device to compute on.
         parallel: Function that maps a fit over receivers.
@@ -353,10 +367,12 @@ def fit_receivers(
             that of single packets. Not studied.
     """
     task = partial(fit_receiver, data=training, config=config, device=device)
+    unknown, training = [each for each in number.tolist() if each not in known], training.columns(number)
     with progress_bar(progress) as bar:
-        fits = parallel(task, range(len(training.receiver_names)))
-        results = list(bar.track(fits, total=len(training.receiver_names), description="receivers"))
-    fitted = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+        fits = bar.track(parallel(task, unknown), total=len(unknown), description="receivers")
+        results = {**known, **dict(zip(unknown, fits, strict=True))}
+    names = results[int(number[0])]
+    fitted = {name: torch.stack([results[each][name] for each in number.tolist()]) for name in names}
     held_out, covariance = fitted.pop("held_out").permute(1, 2, 0), fitted.pop("covariance")
     loss, measured = training.path_loss, ~training.rssi.isnan()
     distance = log_distance(training.position, training.receiver)
@@ -380,7 +396,8 @@ def fit_receivers(
     predicted = power - training.shift
     error = (predicted[0] - training.rssi)[measured].abs()
     score -= len(error) * math.log(max(float(error.mean()), 1e-3))
-    return Fit(training, fitted, covariance, distance, predicted, std, noise_db[-1], detection_field, detection, score)
+    rest = covariance, distance, predicted, std, noise_db[-1], detection_field, detection, score
+    return Fit(training, results, fitted, *rest)
 
 
 def _in_threads(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterable[Any]:

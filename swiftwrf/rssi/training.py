@@ -121,6 +121,10 @@ class RssiTraining(Bins):
     field_db: Tensor
     noise_db: Tensor
 
+    def columns(self, number: Tensor) -> Self:
+        kept = {name: getattr(self, name)[..., number] for name in ("shift", "limit", "field_db", "noise_db")}
+        return replace(super().columns(number), path_loss=self.path_loss.columns(number), **kept)
+
 
 @single_thread()
 def prepare(

@@ -405,9 +405,10 @@ class _Search:
         posterior, width = Posterior(flat, log_weight, resolution_m), MODE_WIDTH * self.extent_m
         modes = []
         for at, mass, height in zip(flat, posterior.weight, cells.position[..., 2], strict=True):
-            near = torch.exp(-torch.cdist(at, at).square() / (2 * width**2)) * mass
+            likely = mass > 1e-9 * mass.max()  # all others together do not move the mode
+            near = torch.exp(-torch.cdist(at[likely], at[likely]).square() / (2 * width**2)) * mass[likely]
             best = int(near.sum(dim=1).argmax())
-            modes.append(torch.stack([*at[best, :2], (near[best] @ height) / near[best].sum()]))
+            modes.append(torch.stack([*at[likely][best, :2], (near[best] @ height[likely]) / near[best].sum()]))
         position = torch.stack(modes)
         away = (flat[..., :2] - position[:, None, :2]).norm(dim=2)
         order = away.argsort(dim=1)

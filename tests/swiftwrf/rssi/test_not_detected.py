@@ -15,8 +15,10 @@ from swiftwrf.data.rssi import Offsets
 from swiftwrf.gp import Kernel
 from swiftwrf.rssi import compare
 from swiftwrf.rssi.detection import Detection, DetectionField
+from swiftwrf.rssi.head import Heads
 from swiftwrf.rssi.offsets import estimate_floor_attenuation
 from swiftwrf.rssi.path_loss import fit_path_losses, log_distance
+from swiftwrf.rssi.regression import solve
 from swiftwrf.testing import check_saved
 
 LIMIT = -88.0
@@ -254,3 +256,26 @@ def test_the_built_in_floor_misses_packets_at_random():
     model = RssiModel().fit(rssi_room(n=200))
     missed = float(model.detection.missed[model.detection.is_limit].mean())
     assert f"{missed:.0%} of all packets are missed at any power" in model.detection.note(model.receiver_names)
+
+
+@pytest.mark.parametrize(("field_db", "n_limits"), [(20.0, 1), (15.0, 10)])
+def test_a_field_whose_head_bends_is_solved_in_few_steps(monkeypatch, field_db, n_limits):
+    """The latent field is K s a with the dual coefficients a of its own tangent."""
+    generator, n, noise_db = torch.Generator().manual_seed(1), 150, 3.0
+    position = torch.rand(n, 3, generator=generator, dtype=torch.float64) * 100
+    covariance = field_db**2 * Kernel(60.0, 20.0, matern12_weight=0.6)(position, position)
+    heads, latent = Heads.alike(50, 0), torch.linalg.cholesky(covariance + 1e-6 * torch.eye(n))
+    latent = latent @ torch.randn(n, generator=generator, dtype=torch.float64)
+    power = heads(latent[:, None])[0][:, 0] + noise_db * torch.randn(n, generator=generator, dtype=torch.float64)
+    order, weak = power.argsort(descending=True), torch.arange(n) >= n - n_limits
+    value, covariance = power[order].clamp_min(power[order][n - n_limits]), covariance[order][:, order]
+    steps, cholesky = [], torch.linalg.cholesky
+    monkeypatch.setattr(torch.linalg, "cholesky", lambda matrix: steps.append(1) or cholesky(matrix))
+    system = value, weak, torch.ones(n, 1).double(), covariance, torch.full((n,), noise_db).double()
+    dual, slope, variance, value, _ = solve(*system, heads, 1.345, (2.0, 0.01))
+    latent = covariance @ (slope * dual)
+    head, slope = (each[:, 0] for each in heads(latent[:, None]))
+    total = slope[:, None] * covariance * slope + 1 + variance.diag()
+    again = covariance @ (slope * torch.linalg.solve(total, value + slope * latent - head))
+    assert len(steps) < 15
+    assert float((again - latent).abs().mean()) < 0.4  # [dB]
