@@ -112,6 +112,11 @@ class Maps:
         return f"{self.direction} {self.coverage['threshold_dbm']:g} {self.unit}"
 
     @property
+    def who(self) -> str:
+        """Receivers that count for the coverage, in sentences."""
+        return f"one of {len(self.names)} receivers" if len(self.names) > 1 else self.names[0]
+
+    @property
     def measurement(self) -> str:
         """Name of the values that the coverage counts."""
         return "detected packet" if self.unit == "dBm" else "measurement"
@@ -190,11 +195,10 @@ class Maps:
     def coverage_plot(cls, floors: Sequence[Maps]) -> Plot:
         """Return the map of coverage of each floor of a run."""
         first = floors[0]
-        found, several = first.coverage, len(first.names) > 1
-        who = f"one of {len(first.names)} receivers" if several else first.names[0]
+        found = first.coverage
         far = "" if found["reach_m"] is None else f", or farther than {found['reach_m']:.1f} m from any"
         caption = (
-            f"Coverage: a {first.measurement.split()[-1]} at {who} is {first.limit} with a probability of at least "
+            f"Coverage: a {first.measurement.split()[-1]} at {first.who} is {first.limit} with a probability of at least "
             f"{found['certainty']:.0%} (covered), of at most {1 - found['certainty']:.0%} (not covered), or between them "
             f"(uncertain). Percentages are of the measured area. Grey: not between the scans (dots){far}. Numbers: weak "
             "spots of the table. Crosses: receivers."
