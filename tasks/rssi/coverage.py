@@ -65,7 +65,9 @@ def held_out_sentence(run: Records) -> str:
     if "n_test" not in rows or not (n := rows["n_test"].sum()):
         return ""
     above, predicted = ((rows["n_test"] * rows[name]).sum() / n for name in ("test_above", "test_predicted"))
-    return f"Of {n:.0f} test scans, which took no part in the fit, {above:.0%} pass and {predicted:.0%} were predicted to."
+    return (
+        f"Of {n:.0f} test scans, which took no part in the fit, {above:.0%} pass and {predicted:.0%} were predicted to."
+    )
 
 
 def spots_sentence(floors: Sequence[Maps]) -> str:

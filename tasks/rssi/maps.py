@@ -1,4 +1,4 @@
-"""Maps of the RSSI report: prediction and uncertainty of a receiver, and of the best server."""
+"""Maps of the RSSI report: prediction and uncertainty of a receiver, and of the best receiver."""
 
 from __future__ import annotations
 
@@ -214,18 +214,17 @@ class Maps:
         return Plot("coverage", [maps.covered(width) for maps in floors], caption, concat(data, ignore_index=True))
 
     def summary(self) -> Plot:
-        """Return map and uncertainty of the only receiver, or of the best server."""
+        """Return map and uncertainty of the only receiver, or of the best receiver."""
         several = len(self.names) > 1
         receiver = None if several else 0
-        title = self.titled("best server" if several else self.names[0])
+        title = self.titled("best receiver" if several else self.names[0])
         kinds = ("predicted", "width") if self.varies else ("predicted",)
         panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
         same = f"; the {widths} is about {self.amount(self.widest[3])} in the whole measured area"
         widths = f", and the {widths}" if self.varies else same
         caption = f"Predicted {self.quantity}{widths}. {self.hatched}" + (
-            f" The best server is the receiver with the {'lowest' if self.is_below else 'highest'} prediction; crosses mark "
-            "receivers."
+            f" The best receiver has the {'lowest' if self.is_below else 'highest'} prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
             "marks the receiver."
@@ -308,7 +307,7 @@ class Maps:
 
     @property
     def widest(self) -> tuple[float, float, float, float]:
-        """Cell between the scans where the interval at the best server is widest: x, y [m], width, and median width [dB].
+        """Cell between the scans where the interval at the best receiver is widest: x, y [m], width, and median width [dB].
 
         The median is that of the measured cells, or of all if there are none.
         """

@@ -246,7 +246,7 @@ def where_next(run: Records) -> str:
             x, y, width, typical = maps.widest
             at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
             widest.append(f"{at} ({maps.amount(width)} instead of {maps.amount(typical)})")
-        best = " of the best server" if len(floors[0].names) > 1 else ""
+        best = " of the best receiver" if len(floors[0].names) > 1 else ""
         return f"Measure around {', '.join(widest)}: the {LEVEL:.0%} interval{best} is widest there."
     if (n := int(places(torch.from_numpy(run.arrays("maps")["measured_position"])).max()) + 1) < MIN_POSITIONS:
         return f"Measure at more positions: {n} are too few to show how {floors[0].quantity} varies between them."

@@ -89,10 +89,10 @@ def test_one_number_everywhere(building, floor):
     place = f"the measured area of {('Ground floor', 'floor 1')[floor]}"
     headline = f"{shares['covered']} of {place}"
     sentence = (
-        f"{headline} is covered (one of 3 receivers above -75 dBm with at least 90% probability), {shares['not_covered']} is "
-        f"not covered (at most 10%), {shares['uncertain']} is uncertain (between them). {shares['scans_above']} of the "
-        f"{rows.sum()} scans pass the threshold. {shares['not_measured']} of the area between the scans is not measured, over "
-        f"{reach(model):.1f} m from any scan."
+        f"{headline} is covered (one of 3 receivers above -75 dBm with at least 90% probability), "
+        f"{shares['not_covered']} is not covered (at most 10%), {shares['uncertain']} is uncertain (between them). "
+        f"{shares['scans_above']} of the {rows.sum()} scans pass the threshold. {shares['not_measured']} of the area "
+        f"between the scans is not measured, over {reach(model):.1f} m from any scan."
     )
     report = unescape(re.sub("<[^>]*>", "", (folder / "report.html").read_text()))
     for text in (terminal, report):
