@@ -54,6 +54,9 @@ class AoaConfig(ReadingConfig):
             "--synthesizer",
         ),
     ] = (AUTO,)
+    only: tuple[str, ...] = ()
+    """estimators that are compared, e.g. kernel_regression, which saves time: other ones, other field models and the room
+    that these need are left out (default: all)"""
     scene: str | None = None
     """room of swiftwrf scenes or Mitsuba scene (FILE.xml) for --models raytrace, in the coordinates of the data
     (default: the room that it estimates from the spectra)"""
@@ -165,6 +168,9 @@ class RssiTaskConfig(FloorPlanConfig):
     also: tuple[str, ...] = ()
     """predictors that are compared only when named: nerf2 takes minutes; pairs and knn_pairs are for data with both ends
     moving, where they are compared anyway"""
+    only: tuple[str, ...] = ()
+    """predictors that are compared with the model and the mean, e.g. knn, which saves time (default: all that suit the
+    data)"""
     not_detected: NotDetected = "auto"
     """meaning of an empty cell: weak, the signal was below the limit of detection; unknown, it is ignored; auto decides for
     each receiver by the data"""
@@ -194,7 +200,7 @@ class RssiTaskConfig(FloorPlanConfig):
 
     def check(self) -> None:
         super().check()
-        for name in self.also:
+        for name in (*self.also, *self.only):
             RSSI_PREDICTORS.check(name)
         check_repeats(self.seed, self.repeats)
         if self.above and self.below:

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from swiftwrf.data.cells import parsed, plain_name, text_of
-from swiftwrf.data.coordinates import floor_numbers
 from swiftwrf.data.powers import KNOWN_FILLERS, MIN_RSSI_DBM
 from swiftwrf.data.radios import unknown_ids
 from swiftwrf.errors import InputError, listed
@@ -77,7 +76,6 @@ ACCURACY = re.compile(
     rf"(?:{GPS}|h_?|horizontal_?|position_?|fix_?)(?:accuracy|uncertainty|[hp]?dop)(?:_?(?:m|met(?:er|re)s))?"
 )
 HOPS = re.compile(r"(?:n_?)?hops(?:_?(?:away|taken|count))?|hop_?count")  # of packets in a mesh
-STOREY = re.compile(r"(?:level|map|plan|floor_?plan|niveau|ebene|geschoss|piso)(?:_?(?:id|name|no|number))?")
 GEODETIC = {"x": "longitude", "y": "latitude"}  # that take the place of x and y
 
 
@@ -124,10 +122,6 @@ def find_roles(
                 f"{role}=NAME"
             )
         roles[role] = matches[0] if role != "receiver" else _with_known_ids(table, matches)
-    if "floor" not in roles:
-        roles |= _floor_by_values(
-            source, table, [name for name in table.columns if name not in (*roles.values(), *taken)]
-        )
     for role, other in GEODETIC.items():
         if other in roles and role in roles:
             del roles[other]
@@ -147,24 +141,6 @@ def find_roles(
             )
         del roles["receiver"]  # which distinguishes rows of a wide table
     return roles
-
-
-def _floor_by_values(source: object, table: pd.DataFrame, names: Sequence[str], max_values: int = 20) -> dict[str, str]:
-    """Return the column that is named like levels or maps, and whose values are those of floors. The bound is not studied.
-
-    Raises:
-        InputError: The question whether other names are those of floors, because plans have positions of their own.
-    """
-    for name in names:
-        values = sorted(set(text_of(table[name])) - {""})
-        if STOREY.fullmatch(plain_name(name)) and 2 <= len(values) <= max_values and parsed(table[name])[1].any():
-            if not np.isnan(floor_numbers(values)).any():
-                return {"floor": name}
-            raise InputError(
-                f"{source}: are the values of {name!r} floors ({listed(values)})? Then number them and give --columns "
-                f"floor={name}; rows of several plans with positions of their own belong into several tables"
-            )
-    return {}
 
 
 def relay_columns(table: pd.DataFrame) -> list[str]:

@@ -25,8 +25,9 @@ from swiftwrf.data.zones import in_one_zone, zone_column
 from swiftwrf.errors import InputError, listed
 from swiftwrf.positions import cells, check_positions
 
-LEVEL = re.compile(
-    r"(?:(?P<level>(?:building_?)?level|flr|story)|(?:floor_?)?(?:map|plan))(?:_?(?:id|name|no|number))?"
+STOREY = re.compile(
+    r"(?:(?P<level>(?:building_?)?level|flr|story|niveau|ebene|geschoss|piso)|(?:floor_?)?(?:map|plan))"
+    r"(?:_?(?:id|name|no|number))?"
 )
 
 
@@ -40,7 +41,7 @@ def floor_column(source: object, table: pd.DataFrame, taken: Collection[str], ma
         max_floors: Number of different values, at most (not studied).
 
     Raises:
-        InputError: The question whether a column of maps, or of levels without a known order, contains the floors.
+        InputError: The question whether a column of numbered maps, or of names without a known order, contains the floors.
 
     Example:
         >>> floor_column("a.csv", pd.DataFrame({"x": [0, 1], "Level": ["Ground", "1st"]}), ["x"])
@@ -50,10 +51,11 @@ def floor_column(source: object, table: pd.DataFrame, taken: Collection[str], ma
         cells = text_of(table[name])
         if name in taken or not 2 <= cells.nunique() <= max_floors:
             continue
-        kind = LEVEL.fullmatch(plain_name(name))
+        kind = STOREY.fullmatch(plain_name(name))
         if not kind or is_rssi(table[name]):
             continue
-        if kind["level"] and not np.isnan(floor_numbers(cells[cells != ""].unique().tolist())).any():
+        order = floor_numbers(cells[cells != ""].unique().tolist())
+        if (kind["level"] or parsed(table[name])[1].any()) and not np.isnan(order).any():
             return str(name)
         raise InputError(
             f"{source}: is {name!r} ({listed(cells.unique())}) the floor of each row? Then give --columns "

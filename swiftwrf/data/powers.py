@@ -243,7 +243,7 @@ def check_powers(source: object, rssi: Floats, receivers: Sequence[str], table_r
     if not bad.any():
         return
     rows = np.broadcast_to(table_row, rssi.shape)
-    if np.nanmedian(rssi) > 0:
+    if bad.sum() > 1 and np.nanmedian(rssi) > 0:  # one is an error
         raise InputError(
             f"{source} has positive values of RSSI; if they are dBm without sign, give unit positive, and if they are "
             "percent, unit percent"

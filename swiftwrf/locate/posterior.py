@@ -250,7 +250,7 @@ class Posterior(Displayed):
             >>> at = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]]], dtype=torch.float64)
             >>> posterior = Posterior(at, torch.tensor([[0.75, 0.25]], dtype=torch.float64).log(), 0.1)
             >>> posterior.credible_radii([0.5, 0.9]).round(decimals=3).tolist()
-            [[0.025, 1.025]]
+            [[0.033, 1.017]]
         """
         radii = self._radii(_distances(self.position, self.median), levels)
         return self.inflation * (radii + self.resolution_m / 4)

@@ -62,6 +62,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
         test,
         config.measured,
         models,
+        config.only or None,
         extra=config.extra,
         preset=config.preset,
         repeats=config.repeats,

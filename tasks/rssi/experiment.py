@@ -41,7 +41,8 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
     rooms = rooms_beside(how, config.rooms, data.origin, data.floors)
     for note in data.notes:
         console.print(f"{data.name}: {note}")
-    for reason in compared(data, config.also)[1].values() if data.is_power else ():  # others have no models of power
+    left_out = compared(data, config.also, config.only)[1] if data.is_power else {}  # others have no models of power
+    for reason in left_out.values():
         console.print(f"left out: {reason}")
     label = f"rx{'_'.join(config.receivers)}-s{config.seed}"
     source = data.source | (rooms.source if rooms else {}) | (plan.source if plan else {})
@@ -60,6 +61,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 split=config.split,
                 seed=config.seed,
                 also=config.also,
+                only=config.only,
                 preset=config.preset,
                 not_detected=config.not_detected,
                 validation=config.validation,

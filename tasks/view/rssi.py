@@ -146,7 +146,8 @@ class RssiView:
     @cached_property
     def _coverage(self) -> Row:
         """Coverage of the lowest floor of the run, empty without a run."""
-        found = read_json(self.folder / METRICS).get("coverage") if self.folder is not None else None
+        file = None if self.folder is None else self.folder / METRICS
+        found = read_json(file).get("coverage") if file is not None and file.is_file() else None
         return dict(found[0]) if found else {}
 
     @property

@@ -10,8 +10,11 @@ from swiftwrf.data import Rssi
 from swiftwrf.errors import InputError
 from swiftwrf.rssi.base import RssiPredictor
 from swiftwrf.rssi.model import RssiModel
+from swiftwrf.rssi.pairs import PairModel
 from swiftwrf.rssi.paper import RssiPaperModel
 from swiftwrf.runtime.validation import Preset, checked
+
+ALWAYS = (RssiModel.name, PairModel.name, "mean")  # compared whatever is named
 
 
 @checked
@@ -36,12 +39,15 @@ def make_predictor(name: str, preset: Preset = "quick", **options: Any) -> RssiP
     return predictor_type(**predictor_type.supported({"preset": preset} | options))
 
 
-def compared(data: Rssi, also: Sequence[str | RssiPredictor] = ()) -> tuple[list[str], dict[str, str]]:
+def compared(
+    data: Rssi, also: Sequence[str | RssiPredictor] = (), only: Sequence[str] = ()
+) -> tuple[list[str], dict[str, str]]:
     """Return the names of the predictors that are compared on these data, and the reason for each one that is left out.
 
     Args:
         data: RSSI.
         also: Names of predictors that are compared only when named, and predictors of your own with other names.
+        only: Predictors beside the model of this package and the mean, in place of all that suit the data.
 
     Raises:
         InputError: An unknown name, or a predictor of your own with a known one.
@@ -50,13 +56,17 @@ def compared(data: Rssi, also: Sequence[str | RssiPredictor] = ()) -> tuple[list
         >>> import swiftwrf
         >>> compared(swiftwrf.rssi_room(n=20))[0]
         ['swiftwrf', 'mean', 'mri_pooled', 'mri_receiver', 'knn', 'mri_residual', 'gp']
+        >>> compared(swiftwrf.rssi_room(n=20), only=["knn"])[0]
+        ['swiftwrf', 'mean', 'knn']
     """
     own = [predictor for predictor in also if isinstance(predictor, RssiPredictor)]
-    for name in also:
+    for name in (*also, *only):
         if isinstance(name, str):
             RSSI_PREDICTORS.check(name)
     types = {name: RSSI_PREDICTORS[name] for name in RSSI_PREDICTORS}
-    types = {name: one for name, one in types.items() if one.compared(data) or name in also}
+    types = {name: one for name, one in types.items() if one.compared(data) or name in (*also, *only)}
+    if only:
+        types = {name: one for name, one in types.items() if name in (*ALWAYS, *also, *only)}
     for predictor in own:
         if predictor.name in RSSI_PREDICTORS or predictor.name in types:
             raise InputError(

@@ -246,6 +246,7 @@ def compare(
     split: str = "random",
     seed: int = 0,
     also: Sequence[str | RssiPredictor] = (),
+    only: Sequence[str] = (),
     preset: Preset = "quick",
     reference: str | None = None,
     not_detected: NotDetected = "auto",
@@ -269,6 +270,7 @@ def compare(
             split, 13, all other places predict each one.
         seed: Seed of everything random.
         also: Predictors that are compared only when named, e.g. "nerf2", and predictors of your own, which stay as they are.
+        only: Predictors beside the model of this package and the mean, in place of all that suit the data.
         preset: "quick", or "paper" for published settings.
         reference: Group whose offset is 0. Defaults to the most frequent one.
         not_detected: Meaning of an empty cell; see `RssiConfig`.
@@ -287,8 +289,7 @@ def compare(
 
     Raises:
         InputError: Unknown receivers, split or predictors, no test row that a receiver detects, too few rows, fewer than 5
-            places, or `keep` of
-            another call.
+            places, or `keep` of another call.
 
     Example:
         >>> import swiftwrf
@@ -317,7 +318,7 @@ def compare(
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
         options["calibration"] = "block"
-    names, left_out = compared(chosen, also)
+    names, left_out = compared(chosen, also, only)
     own = {predictor.name: predictor for predictor in also if isinstance(predictor, RssiPredictor)}
     if keep is not None:
         if own:

@@ -167,8 +167,8 @@ def read(path: str | Path, options: ReadOptions, *registries: Registry[Format[An
                 "RSSI": RSSI_FORMATS,
             }
             here = sorted(kind for kind, registry in others.items() if registry in registries)
-            for kind in others.keys() - here:
-                if _readers(source, options, others[kind]):
+            for kind in others:
+                if kind not in here and _readers(source, options, others[kind]):
                     commands = "rssi and swiftwrf locate" if kind == "RSSI" else "aoa"
                     raise InputError(
                         f"{source} looks like {kind}, which swiftwrf {commands} can read; expected {' or '.join(here)}"

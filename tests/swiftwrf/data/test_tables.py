@@ -368,9 +368,7 @@ def test_a_column_named_like_levels_is_the_floor_by_its_values_or_asked_about(ta
     data = Rssi.from_frame(table.assign(**{name: third}))
     assert list(data.floors.names) == ["Ground floor", "1st floor", "2nd floor"]
     assert data.transmitter_position[:, 2].tolist() == np.repeat([0.0, 4.0, 8.0], N // 3).tolist()
-    with pytest.raises(
-        InputError, match=rf"are the values of '{name}' floors \(office, store\).*--columns floor={name}"
-    ):
+    with pytest.raises(InputError, match=rf"is '{name}' \(office, store\) the floor .*--columns floor={name}"):
         Rssi.from_frame(table.assign(**{name: ["office", "store"] * (N // 2)}))
     battery = Rssi.from_frame(table.assign(**{name: 87}))
     assert battery.floors is None

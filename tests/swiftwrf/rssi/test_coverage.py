@@ -134,6 +134,7 @@ def test_a_small_area_without_coverage_comes_before_a_large_uncertain_one():
     x, field = np.arange(8.0), np.full((1, 1, 8), -70.0, dtype=np.float32)
     chart = RssiMap(x, np.zeros(1), 1.0, 1.0, field, np.ones_like(field), np.ones_like(field), ("a",))
     measured, limits = np.ones_like(probability, dtype=bool), {"threshold_dbm": -70.0, "certainty": 0.9, "at_least": 1}
+    limits["direction"] = "above"
     spots = Coverage(probability, measured, measured, limits).weak_spots(chart)
     assert spots[["x_m", "area_m2", "not_covered_m2"]].to_numpy().tolist() == [[7.0, 1.0, 1.0], [0.0, 6.0, 0.0]]
 

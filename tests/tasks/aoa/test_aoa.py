@@ -519,6 +519,19 @@ def test_coarray_takes_the_array_from_the_file_beside_the_data(small, tmp_path):
     assert model.synthesize(small.position[:2]).shape == (2, 10, 40)
 
 
+def test_only_the_named_estimators_are_compared_and_no_room_is_searched(small, tmp_path, capsys):
+    (tmp_path / "data").mkdir()
+    write_spectra(small, tmp_path / "data")
+    turbo = ("--mix", 0.5, "--models", "coarray", "--data", tmp_path / "data", "--out", tmp_path / "run")
+    assert quick.run("aoa", *turbo, "--extra", 0, "--only", "kernel_regression") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["mixes"]["0.5"]
+    assert {name.split(",")[0] for name in metrics["methods"]} == {"kernel_regression"}
+    assert set(metrics["synthesis"]) == {"coarray"}
+    said = "".join(capsys.readouterr())
+    assert "training and testing kernel_regression" in said
+    assert "finding the room" not in said
+
+
 @pytest.mark.cuda
 def test_whole_run_on_a_gpu(small, small_published, tmp_path):
     trained = ("swiftwrf", "swiftwrf_paper", "nerf2", "wrfgs", "vae", "dcgan")

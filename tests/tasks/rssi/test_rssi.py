@@ -385,6 +385,14 @@ def test_floors_have_maps_of_one_size_the_strongest_receivers_first(tmp_path):
         assert said == [*(f"{name} {shares[key]:.0%}" for name, key in named.items()), "not measured"]
 
 
+def test_only_the_named_predictors_are_compared(tmp_path, capsys):
+    assert quick.run("rssi", "--rx", 6, "--only", "mri_receiver", "--out", tmp_path / "run") == 0
+    errors = pd.read_csv(tmp_path / "run" / "errors.csv")
+    assert set(errors["method"]) == {"swiftwrf", "mean", "mri_receiver"}
+    assert quick.run("rssi", "--only", "nearest", "--out", tmp_path / "other") == 2
+    assert "nearest" in capsys.readouterr().err
+
+
 def test_a_report_has_its_figures_as_pdf(rssi_run, tmp_path):
     merge([rssi_run], tmp_path / "report", pdf=True)
     figures = tmp_path / "report" / "figures"

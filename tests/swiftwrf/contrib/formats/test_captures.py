@@ -90,9 +90,9 @@ def test_captures_of_one_antenna_receive_no_direction(tmp_path):
             load_snapshots(source)
 
 
-def test_a_table_of_positions_is_no_survey(tmp_path):
+def test_captures_with_positions_are_no_survey(tmp_path):
     write_captures(tmp_path)
-    with pytest.raises(InputError, match="none of the known formats"):
+    with pytest.raises(InputError, match="looks like array snapshots, which swiftwrf aoa can read; expected RSSI"):
         load_rssi(tmp_path)
 
 
