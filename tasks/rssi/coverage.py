@@ -107,7 +107,7 @@ def section(run: Records) -> Section:
         tables.append(_rooms(run.table("rooms"), limit))
     if run.metrics.get("bands"):
         tables.append(_table(run.table("bands"), several, limit, by="band"))
-    found = Section("", [*filter(None, [why(run)])], tables)
+    found = Section("", tables=tables)
     if of_one.all():
         found.tables.append(_table(every, several, limit))
     else:

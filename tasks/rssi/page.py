@@ -118,9 +118,9 @@ def _maps(run: Records, kind: str) -> Section:
 
 def _errors(run: Records, found: Answer) -> Section:
     caption = (
-        f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test places. Over splits: mean and standard deviation of the median error. Detection: mean of the "
-        "fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
+        f"Column of {model_of(run)}: difference of the mean absolute errors on the same measurements, with its 95 % "
+        "bootstrap interval over test places. Over splits: mean and standard deviation of the median error. Detection: "
+        "mean of the fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
     )
     section = errors_section(
         found,
@@ -190,7 +190,7 @@ def conclusion(run: Records) -> list[str]:
         f"{error['p90']:.1f} {unit}, and {interval['coverage']:.0%} of the measurements lie in their "
         f"{interval['nominal']:.0%} intervals. {tested}"
     )
-    compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="pairs")
+    compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="measurements")
     return [
         *recommendation(run, own, unit)[1],
         *(coverage.coverage_sentence(maps.coverage, f"{maps.who} {maps.limit}", maps.place) for maps in floors),
@@ -301,7 +301,7 @@ def _differences(run: Records) -> list[Plot]:
     figure = figures.dots(shown, {own: values[own][: len(shown)]}, COLOURS, label, zero=True)
     caption = (
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
-        f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
+        f"the same measurements; whiskers: 95 % intervals. Below zero {own} is better."
     )
     data = figures.dots_data("receiver", names, values, suffix(Maps(run).error_unit))
     return [Plot(f"difference-{run.file_name}", [figure], caption, data)]
