@@ -108,7 +108,9 @@ def test_positions_of_faint_and_loud_channels():
         data = snapshots(scale).spectra((6, 24)).subset(first)
         fitted.append(MatchedField(config).fit(data, room=GeometryModel.of_planes(data, built_in_walls(0.7))))
     usual = predict(fitted[0], snapshots().spectra((6, 24)).subset(last))
-    for locator, scale in [(fitted[0], scale) for scale in SCALES] + [(other, 1.0) for other in fitted[1:]]:
+    for locator, scale in [(fitted[0], scale) for scale in (SCALES[0], SCALES[-1])] + [
+        (other, 1.0) for other in fitted[1:]
+    ]:
         found = predict(locator, snapshots(scale).spectra((6, 24)).subset(last))
         for name in ("x_m", "y_m", "z_m", "credible_radius_80_m"):
             assert found[name].tolist() == pytest.approx(usual[name].tolist(), abs=2e-3)

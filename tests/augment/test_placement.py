@@ -10,7 +10,7 @@ import torch
 from rooms import OFFICE_WALLS
 from small import known_planes
 
-from augment.placement import StationSuggestion, suggest_station, wall_poses
+from augment.placement import StationSuggestion, _most_weighted, _placed, _positions, suggest_station, wall_poses
 from swiftwrf import AngularGrid, ArrayPose, InputError, MatchedField, Spectra, Stations, simulated_stations
 from swiftwrf.array.beamforming import unit_phasor
 from swiftwrf.array.planar import PlanarArray
@@ -65,6 +65,26 @@ def test_a_further_array_lowers_the_expected_error_and_one_far_away_least(locato
     assert again.error_m.equal(found.error_m[:1])
 
 
+def test_the_gain_is_a_difference_of_medians_with_a_bootstrap_of_positions(locator):
+    pose = ArrayPose.facing((4.0, 0.1, 1.9), (0, 1, 0))
+    found = suggest_station(locator, 1, [pose], n_positions=24, config=TINY)
+    position = _positions(locator, 24, 0)
+    own = {name: (name, room) for name, room in locator.rooms.items()}
+    like = _most_weighted(locator)
+
+    def errors(more):
+        posterior = locator.elsewhere(own | more, TINY).located_samples(position, 0)
+        return (posterior.median - position).norm(dim=1).numpy()
+
+    before, after = errors({}), errors({"": (like, _placed(locator.rooms[like], pose))})
+    middle = partial(np.quantile, q=0.5, method="lower")  # as torch counts an even number
+    assert float(found.error_m[0]) == pytest.approx(middle(after))
+    assert float(found.gain_m[0]) == pytest.approx(middle(before) - middle(after))
+    rows = np.random.default_rng(0).integers(24, size=(4000, 24))
+    drawn = middle(before[rows], axis=1) - middle(after[rows], axis=1)
+    assert float(found.gain_std_m[0]) == pytest.approx(drawn.std(), rel=0.2)
+
+
 def test_samples_vary_as_held_out_phases(locator):
     """Simulated channels are as coherent with those of the room as measured ones are."""
     likelihoods = locator.likelihoods[0]
@@ -91,7 +111,7 @@ def test_refusals(locator):
 def test_the_suggested_pose_is_no_worse_than_the_median_one(office, locator):
     """On spectra that are simulated with reflections, cupboards and noise at each candidate pose."""
     candidates = wall_poses(locator)[::2]
-    found = suggest_station(locator, 1, candidates, n_positions=60)
+    found = suggest_station(locator, 1, candidates, n_positions=40, config=TINY)
 
     def error(pose: ArrayPose) -> float:
         array = PlanarArray.square(4, OFFICE.frequency_hz)

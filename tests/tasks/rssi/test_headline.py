@@ -135,7 +135,7 @@ def test_test_scans_are_counted_beside_their_prediction(building, floor):
 
 
 def test_the_answer_states_how_near_the_test_rows_are_to_training_rows(building):
-    """By the positions of the split: errors at a neighbouring scan are not those of an unmeasured place."""
+    """The distances are those of the split: errors at a neighbouring scan are not those of an unmeasured place."""
     folder, terminal = building
     train, test = load_rssi(folder.parent / "walk.csv").split()
     apart = cdist(test.transmitter_position.numpy(), train.transmitter_position.numpy()).min(axis=1)
