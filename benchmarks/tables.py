@@ -68,6 +68,13 @@ def explanations() -> str:
     return markdown(["cause", "named rightly", "a cause named wrongly"], rows)
 
 
+def fuzz_containers() -> str:
+    """Return how many random files of each form give the values of their plain form."""
+    found = {form: one for form, one in load("fuzz_containers").items() if isinstance(one, dict) and "wrong" in one}
+    rows = [[form, *(str(one[key]) for key in ("inputs", "read", "refused", "wrong"))] for form, one in found.items()]
+    return markdown(["form", "files", "read", "refused", "wrong"], rows)
+
+
 def hard_cases() -> str:
     """Return the largest errors over cutoffs of each backend in each case."""
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
