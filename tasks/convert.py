@@ -30,13 +30,14 @@ from tasks.configs import FILES, MAP_FILES, ConvertConfig
 from tasks.directory import check_new_file, kept_model, new_directory
 from tasks.environment import command, invocation
 from tasks.options import by_name
-from tasks.page.maps import colour_image
+from tasks.page import figures
 from tasks.records import CONFIG, rounded, write_table
 from tasks.source import reading
 from tasks.terminal import console, terminal
 
 FORMATS = (SPECTRA_FORMATS, SNAPSHOT_FORMATS, RSSI_FORMATS)
 WORLD_FILE = ".pgw"  # suffix beside a .png
+PNG_DPI = 150  # pixels an inch of an image
 
 
 def run(config: ConvertConfig) -> None:
@@ -191,10 +192,19 @@ def _write_map(data: RssiMap, file: Path) -> str:
             return described
     strongest = data.mean.max(axis=0)
     low, high = np.percentile(strongest, (1, 99)).tolist()
+    x0, x1, y0, y1 = data.corners
+    figure, axes = figures.panel(9.0, 1.2 + 7.0 * float(np.clip((y1 - y0) / (x1 - x0), 0.3, 1.5)))
+    data.plot(ax=axes)
+    axes.images[0].set_clim(low, max(high, low + 1))
+    axes.set_aspect("equal")
+    axes.grid(visible=False)
+    figure.set_dpi(PNG_DPI)
     with replacing(file) as temporary:
-        colour_image(strongest[::-1], "viridis", low, max(high, low + 1)).save(temporary, "PNG")
-    write_world_file(file.with_suffix(WORLD_FILE), data)
-    return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright)"
+        figure.savefig(temporary, format="PNG", dpi=PNG_DPI)
+    columns, rows = figure.canvas.get_width_height()
+    (left, bottom), (right, top) = axes.transData.inverted().transform([(0, 0), (columns, rows)]).tolist()
+    write_world_file(file.with_suffix(WORLD_FILE), (left, right, bottom, top), (columns, rows), data.origin)
+    return f"{described}, strongest RSSI from {low:.0f} dBm (dark) to {high:.0f} dBm (bright), with axes and world file"
 
 
 if __name__ == "__main__":

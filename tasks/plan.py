@@ -63,8 +63,16 @@ def run(config: PlanConfig) -> None:
         content = values(found, config)
         write_json(folder / "plan.json", content)
         write_page(folder, page(found, config, records))
-    text = "\n".join([*content["conclusion"], *(_line(step) for step in content["steps"])])
-    terminal.page(content, f"{text}\ncandidates: {out / CANDIDATES}.csv", out / REPORT)
+    steps = map(_line, content["steps"])
+    lines = [
+        *content["conclusion"],
+        "",
+        *steps,
+        "",
+        *map(str, next_steps(config)),
+        f"candidates: {out / CANDIDATES}.csv",
+    ]
+    terminal.page(content, "\n".join(lines), out / REPORT)
 
 
 def survey_of(records: Records) -> tuple[RssiModel, Rssi]:
@@ -159,6 +167,14 @@ def conclusion(steps: Sequence[Row], found: CoveragePlan) -> list[str]:
     return [said]
 
 
+def next_steps(config: PlanConfig) -> list[NextStep]:
+    """Return what to do next."""
+    return [
+        NextStep("Compare your own places", command("plan", config.run, "--at", "places.csv")),
+        NextStep("Measure after the change, since the interval is that of a place where no access point hung yet"),
+    ]
+
+
 def page(found: CoveragePlan, config: PlanConfig, records: Records) -> Page:
     """Return the report: coverage before and after in plan, and tables of the steps and of the best candidates."""
     content = values(found, config)
@@ -182,10 +198,6 @@ def page(found: CoveragePlan, config: PlanConfig, records: Records) -> Page:
         Number(f"{first['coverage']:.0%}", "coverage as surveyed"),
         Number(f"{last['coverage']:.0%}", "coverage after all changes"),
     ]
-    next_steps = [
-        NextStep("Compare your own places", command("plan", config.run, "--at", "places.csv")),
-        NextStep("Measure after the change, since the interval is that of a place where no access point hung yet"),
-    ]
     text = (
         "A further access point has level and slope of the path loss of those surveyed, with their spread, and shadowing of "
         "the correlation that the survey shows. Walls that nobody measured are in the interval and not in the mean."
@@ -194,7 +206,7 @@ def page(found: CoveragePlan, config: PlanConfig, records: Records) -> Page:
         "Coverage is that of the measured area. Interference, load and the power of the clients are not part of it."
     )
     sections = [Section("Candidates", [text], [steps, compared]), Section("What this does not show", [limits])]
-    summary = Summary(numbers, _maps(found), content["conclusion"], next_steps)
+    summary = Summary(numbers, _maps(found), content["conclusion"], next_steps(config))
     return Page(f"Plan: {records.place}", summary, sections)
 
 

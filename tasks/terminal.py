@@ -53,6 +53,9 @@ class NextStep:
     text: str
     code: str = ""
 
+    def __str__(self) -> str:
+        return f"{self.text}: {self.code}" if self.code else self.text
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -226,8 +229,7 @@ class Terminal:
 
     def answer(self, found: Answer, page: Path) -> None:
         """Print the answer of a run: the conclusion, a short table, next steps, and the place of the report."""
-        steps = [f"{step.text}: {step.code}" if step.code else step.text for step in found.next_steps]
-        self._print(found.values(), page, *found.conclusion, "", _table(found), "", *steps)
+        self._print(found.values(), page, *found.conclusion, "", _table(found), "", *map(str, found.next_steps))
 
     def page(self, values: Mapping[str, Any], text: str, page: Path | None = None) -> None:
         """Print the text of a command, or its values with `--json`, and the place of its page. Both may be missing."""

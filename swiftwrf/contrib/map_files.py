@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from swiftwrf.data.coordinates import GeodeticOrigin
 from swiftwrf.errors import InputError, optional_module
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.runtime.durable import write_bytes, write_text
@@ -85,16 +86,25 @@ def write_geojson(file: Path, data: RssiMap) -> None:
     write_text(file, json.dumps({"type": "FeatureCollection", "features": features}, ensure_ascii=False))
 
 
-def write_world_file(file: Path, data: RssiMap) -> None:
-    """Write the world file of an image of a map, the northernmost row on top.
+def write_world_file(
+    file: Path, corners: tuple[float, float, float, float], size: tuple[int, int], origin: GeodeticOrigin | None = None
+) -> None:
+    """Write the world file of an image, the northernmost row on top.
 
-    It contains longitude and latitude (WGS84), exact in the middle of the map, or x and y [m] without an origin.
+    It contains longitude and latitude (WGS84), exact in the middle of the image, or x and y [m] without an origin.
+
+    Args:
+        file: File to write.
+        corners: Edges x0, x1, y0, y1 of the image [m].
+        size: Numbers of its columns and rows.
+        origin: Origin of the metres. Defaults to none.
     """
-    x0, x1, y0, y1 = data.corners
-    place = np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) + data.cell * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0]])
-    if data.origin is not None:
-        place = data.origin.to_degrees(place)[:, ::-1]
+    (x0, x1, y0, y1), (columns, rows) = corners, size
+    pixel = np.array([[0.0, 0.0], [(x1 - x0) / columns, 0.0], [0.0, -(y1 - y0) / rows]])
+    place = np.array([[(x0 + x1) / 2, (y0 + y1) / 2]]) + pixel
+    if origin is not None:
+        place = origin.to_degrees(place)[:, ::-1]
     along_row, along_column = place[1:] - place[0]
-    first = place[0] - along_row * (len(data.x) - 1) / 2 - along_column * (len(data.y) - 1) / 2
+    first = place[0] - along_row * (columns - 1) / 2 - along_column * (rows - 1) / 2
     numbers = (*along_row.tolist(), *along_column.tolist(), *first.tolist())
     write_text(file, "".join(f"{number:.12g}\n" for number in numbers))

@@ -290,7 +290,7 @@ def comparison_sentence(errors: DataFrame, method: str, other: str, *, name: str
     if math.isnan(low):
         n_places = errors.index.get_level_values("place").nunique()
         return f"{n_places} test places are too few to compare {name} with {other}."
-    interval = f"{mean:+.2f} {unit} [{low:+.2f}, {high:+.2f}]"
+    interval = f"{mean:+.2f} {unit} (95 % interval {low:+.2f} to {high:+.2f})"
     if max(abs(low), abs(high)) < MIN_RELEVANT * float(errors[other].mean()):
         return f"On the same {rows} {name} and {other} are equal in practice: mean errors differ by {interval}."
     if high < 0:

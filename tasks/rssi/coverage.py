@@ -16,16 +16,18 @@ MIN_NAMED_M2 = 0.5  # which is 1 as a whole number
 MIN_MISSING_DB = 0.5  # below which lost packets are what is missing
 
 
-def coverage_sentence(found: Row, where: str = "the measured area") -> str:
-    """Return a coverage in words, by `Coverage.values` and the name of the measured area."""
+def coverage_sentence(found: Row, passing: str, where: str = "the measured area") -> str:
+    """Return a coverage in words, by `Coverage.values`, receivers and threshold, and the name of the measured area."""
     if found["covered"] is None:
         return f"No cell of the map is in {where}."
     shares = {name: f"{share:.0%}" for name, share in found.items() if isinstance(share, float)}
     sentence = (
-        f"{shares['covered']} of {where} is covered, {shares['not_covered']} is not, {shares['uncertain']} is uncertain"
+        f"{shares['covered']} of {where} is covered ({passing} with at least {found['certainty']:.0%} probability), "
+        f"{shares['not_covered']} is not covered (at most {1 - found['certainty']:.0%}), {shares['uncertain']} is uncertain "
+        "(between them)"
     )
     if found["scans_above"] is not None:
-        sentence += f"; {shares['scans_above']} of the {found['n_scans']} scans pass"
+        sentence += f". {shares['scans_above']} of the {found['n_scans']} scans pass the threshold"
     if (part := shares["not_measured"]) != "0%":
         far = f"over {found['reach_m']:.1f} m from any scan"
         sentence += f". {part} of the area between the scans is not measured, {far}"
@@ -63,7 +65,9 @@ def held_out_sentence(run: Records) -> str:
     if "n_test" not in rows or not (n := rows["n_test"].sum()):
         return ""
     above, predicted = ((rows["n_test"] * rows[name]).sum() / n for name in ("test_above", "test_predicted"))
-    return f"Of {n:.0f} test scans {above:.0%} pass, {predicted:.0%} were predicted."
+    return (
+        f"Of {n:.0f} test scans, which took no part in the fit, {above:.0%} pass and {predicted:.0%} were predicted to."
+    )
 
 
 def spots_sentence(floors: Sequence[Maps]) -> str:
@@ -103,7 +107,7 @@ def section(run: Records) -> Section:
         tables.append(_rooms(run.table("rooms"), limit))
     if run.metrics.get("bands"):
         tables.append(_table(run.table("bands"), several, limit, by="band"))
-    found = Section("", [*filter(None, [why(run)])], tables)
+    found = Section("", tables=tables)
     if of_one.all():
         found.tables.append(_table(every, several, limit))
     else:

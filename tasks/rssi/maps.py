@@ -1,4 +1,4 @@
-"""Maps of the RSSI report: prediction and uncertainty of a receiver, and of the best server."""
+"""Maps of the RSSI report: prediction and uncertainty of a receiver, and of the best receiver."""
 
 from __future__ import annotations
 
@@ -112,6 +112,11 @@ class Maps:
         return f"{self.direction} {self.coverage['threshold_dbm']:g} {self.unit}"
 
     @property
+    def who(self) -> str:
+        """Receivers that count for the coverage, in sentences."""
+        return f"one of {len(self.names)} receivers" if len(self.names) > 1 else self.names[0]
+
+    @property
     def measurement(self) -> str:
         """Name of the values that the coverage counts."""
         return "detected packet" if self.unit == "dBm" else "measurement"
@@ -190,11 +195,10 @@ class Maps:
     def coverage_plot(cls, floors: Sequence[Maps]) -> Plot:
         """Return the map of coverage of each floor of a run."""
         first = floors[0]
-        found, several = first.coverage, len(first.names) > 1
-        who = f"one of {len(first.names)} receivers" if several else first.names[0]
+        found = first.coverage
         far = "" if found["reach_m"] is None else f", or farther than {found['reach_m']:.1f} m from any"
         caption = (
-            f"Coverage: a {first.measurement.split()[-1]} at {who} is {first.limit} with a probability of at least "
+            f"Coverage: a {first.measurement.split()[-1]} at {first.who} is {first.limit} with a probability of at least "
             f"{found['certainty']:.0%} (covered), of at most {1 - found['certainty']:.0%} (not covered), or between them "
             f"(uncertain). Percentages are of the measured area. Grey: not between the scans (dots){far}. Numbers: weak "
             "spots of the table. Crosses: receivers."
@@ -210,18 +214,17 @@ class Maps:
         return Plot("coverage", [maps.covered(width) for maps in floors], caption, concat(data, ignore_index=True))
 
     def summary(self) -> Plot:
-        """Return map and uncertainty of the only receiver, or of the best server."""
+        """Return map and uncertainty of the only receiver, or of the best receiver."""
         several = len(self.names) > 1
         receiver = None if several else 0
-        title = self.titled("best server" if several else self.names[0])
+        title = self.titled("best receiver" if several else self.names[0])
         kinds = ("predicted", "width") if self.varies else ("predicted",)
         panels = [self._panel(self.best, kind, title, receiver, 4.6 if self.varies else 5.4) for kind in kinds]
         widths = f"width of the {LEVEL:.0%} interval of a measurement"
         same = f"; the {widths} is about {self.amount(self.widest[3])} in the whole measured area"
         widths = f", and the {widths}" if self.varies else same
         caption = f"Predicted {self.quantity}{widths}. {self.hatched}" + (
-            f" The best server is the receiver with the {'lowest' if self.is_below else 'highest'} prediction; crosses mark "
-            "receivers."
+            f" The best receiver has the {'lowest' if self.is_below else 'highest'} prediction; crosses mark receivers."
             if several
             else " Dots: training measurements in the colours of the map, hollow where nothing was received; the cross "
             "marks the receiver."
@@ -304,7 +307,7 @@ class Maps:
 
     @property
     def widest(self) -> tuple[float, float, float, float]:
-        """Cell between the scans where the interval at the best server is widest: x, y [m], width, and median width [dB].
+        """Cell between the scans where the interval at the best receiver is widest: x, y [m], width, and median width [dB].
 
         The median is that of the measured cells, or of all if there are none.
         """

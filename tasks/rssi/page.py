@@ -118,9 +118,9 @@ def _maps(run: Records, kind: str) -> Section:
 
 def _errors(run: Records, found: Answer) -> Section:
     caption = (
-        f"Column of {model_of(run)}: difference of the mean absolute errors on the same pairs, with its 95 % bootstrap "
-        "interval over test places. Over splits: mean and standard deviation of the median error. Detection: mean of the "
-        "fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
+        f"Column of {model_of(run)}: difference of the mean absolute errors on the same measurements, with its 95 % "
+        "bootstrap interval over test places. Over splits: mean and standard deviation of the median error. Detection: "
+        "mean of the fractions of detected and of empty test cells that are predicted as such; 0.5 is chance."
     )
     section = errors_section(
         found,
@@ -170,14 +170,15 @@ def best_baseline(run: Records) -> str:
 def conclusion(run: Records) -> list[str]:
     """Return coverage and error, how sure they are, and how the model compares with the best baseline."""
     best, interval = best_baseline(run), run.metrics["interval"]
-    own, floors, names = model_of(run), Maps.of_floors(run), list(run.metrics["receivers"])
+    own, floors = model_of(run), Maps.of_floors(run)
     unit = floors[0].error_unit
-    who = f"one of {len(names)} receivers" if len(names) > 1 else names[0]
-    first = floors[0].coverage
-    covered = [f"{maps.coverage['covered'] or 0:.0%} of {maps.place}" for maps in floors]
-    error = run.metrics["overall"][own]["abs_error_db"]
-    errors = by_method(run.table("errors")[COLUMNS])
-    tested = f"Tested on {error['n']} measurements, fitted to {run.metrics['n_train']} rows ({run.scene})."
+    error, table = run.metrics["overall"][own]["abs_error_db"], run.table("errors")
+    errors = by_method(table[COLUMNS])
+    near = table[table["method"] == own]["from_training_m"].median()
+    tested = (
+        f"Tested on {error['n']} measurements, half of them within {near:.1f} m of one of the {run.metrics['n_train']} rows "
+        f"of the fit ({run.scene})."
+    )
     if run.metrics["split"] == LEAVE_ONE_OUT:
         count = errors.index.get_level_values("place").nunique()
         tested = (
@@ -185,22 +186,20 @@ def conclusion(run: Records) -> list[str]:
             "intervals of so few positions vary by chance."
         )
     sure = (
-        f"90 % of the errors are below {error['p90']:.1f} {unit}, and {interval['coverage']:.0%} of the measurements lie in "
-        f"their {interval['nominal']:.0%} intervals. {tested}"
+        f"Predictions are within {error['median']:.1f} {unit} (median error), 90 % of the errors are below "
+        f"{error['p90']:.1f} {unit}, and {interval['coverage']:.0%} of the measurements lie in their "
+        f"{interval['nominal']:.0%} intervals. {tested}"
     )
-    compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="pairs")
+    compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="measurements")
     return [
         *recommendation(run, own, unit)[1],
-        f"{', '.join(covered)} {'has' if len(covered) == 1 else 'have'} {who} {floors[0].limit} "
-        f"with {first['certainty']:.0%} certainty; predictions are within {error['median']:.1f} {unit} "
-        "(median error).",
-        *(coverage.coverage_sentence(maps.coverage, maps.place) for maps in floors),
+        *(coverage.coverage_sentence(maps.coverage, f"{maps.who} {maps.limit}", maps.place) for maps in floors),
         *filter(None, [coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
         *filter(None, [coverage.held_out_sentence(run), coverage.why(run)]),
-        *receivers_sentence(run),
-        *repeats_sentence(run),
         sure,
         compared,
+        *receivers_sentence(run),
+        *repeats_sentence(run),
     ]
 
 
@@ -247,7 +246,7 @@ def where_next(run: Records) -> str:
             x, y, width, typical = maps.widest
             at = f"x = {x:.1f} m, y = {y:.1f} m{f' on {maps.name}' if maps.suffix else ''}"
             widest.append(f"{at} ({maps.amount(width)} instead of {maps.amount(typical)})")
-        best = " of the best server" if len(floors[0].names) > 1 else ""
+        best = " of the best receiver" if len(floors[0].names) > 1 else ""
         return f"Measure around {', '.join(widest)}: the {LEVEL:.0%} interval{best} is widest there."
     if (n := int(places(torch.from_numpy(run.arrays("maps")["measured_position"])).max()) + 1) < MIN_POSITIONS:
         return f"Measure at more positions: {n} are too few to show how {floors[0].quantity} varies between them."
@@ -302,7 +301,7 @@ def _differences(run: Records) -> list[Plot]:
     figure = figures.dots(shown, {own: values[own][: len(shown)]}, COLOURS, label, zero=True)
     caption = (
         f"Difference of the mean absolute error of {own} from that of {best}, the best baseline, at each receiver on "
-        f"the same pairs; whiskers: 95 % intervals. Below zero {own} is better."
+        f"the same measurements; whiskers: 95 % intervals. Below zero {own} is better."
     )
     data = figures.dots_data("receiver", names, values, suffix(Maps(run).error_unit))
     return [Plot(f"difference-{run.file_name}", [figure], caption, data)]

@@ -42,6 +42,11 @@ TYPES = dict.fromkeys(COLUMNS, float) | {"index": int} | dict.fromkeys(WORDS, ob
 MEANS = ("error", "covered")  # columns whose means are kept
 WINDOW = 30  # measurements of the running error
 MAX_SURPRISING = 10
+SURPRISE = "error / expected error"  # name of the innovation in the report
+MEANING = (
+    "The expected error is the standard deviation that the model predicts, for spectra up to a factor. Large values in one "
+    "region show a change there. Column `innovation` of `measurements.csv`."
+)
 N_NEIGHBOURS = 5  # measurements whose mean innovation a map shows at each position
 BLUE, RED = "#4477aa", "#ee6677"
 Version = tuple[tuple[int, int], ...]  # time of change [ns] and size of each file
@@ -180,6 +185,12 @@ def _rows(table: Path) -> list[Row]:
         return list(rows.fillna(dict.fromkeys(WORDS, "")).astype(TYPES).to_dict("records"))
 
 
+def next_step(folder: Path) -> NextStep:
+    """Return what to do next with an update in a directory."""
+    text = "Continue with the updated model"
+    return NextStep(text, command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT"))
+
+
 def page(record: Record, name: str, folder: Path) -> Page:
     """Return the page of a record, with the name of its data, of an update in a directory."""
     numbers = [
@@ -189,17 +200,14 @@ def page(record: Record, name: str, folder: Path) -> Page:
     ]
     if math.isfinite(covered := record.mean("covered")):
         numbers.append(Number(f"{covered:.0%}", "of the values inside their 80 % interval"))
-    step = NextStep(
-        "Continue with the updated model", command("update", str(folder / MODEL), "SOURCE", "--out", "NEXT")
-    )
-    summary = Summary(numbers, [error_plot(record)], record.sentences(), [step])
+    summary = Summary(numbers, [error_plot(record)], record.sentences(), [next_step(folder)])
     surprising = record.table.dropna(subset="innovation").nlargest(MAX_SURPRISING, "innovation")
     cells = [
         [str(row["index"]), *(f"{row[key]:.3g}" for key in ("x_m", "y_m", "z_m", "error", "innovation"))]
         for row in surprising.to_dict("records")
     ]
-    columns = ["measurement", "x [m]", "y [m]", "z [m]", record.error_label, "innovation"]
-    table = Table(columns, cells, "Measurements with the largest innovations.")
+    columns = ["measurement", "x [m]", "y [m]", "z [m]", record.error_label, SURPRISE]
+    table = Table(columns, cells, f"Measurements whose error is largest beside the expected one. {MEANING}")
     return Page(f"Update: {name}", summary, [Section("Surprising measurements", [], [table], [map_plot(record)])])
 
 
@@ -217,15 +225,15 @@ def error_plot(record: Record) -> Plot:
 
 
 def map_plot(record: Record) -> Plot:
-    """Return the positions from above with their innovations."""
+    """Return the positions from above with their errors relative to the expected ones."""
     figure, axes = figures.panel(6.8, 5)
     shown = record.table[["x_m", "y_m", "z_m", "innovation"]].astype(float)
     position, innovation = torch.tensor(shown.to_numpy()).split([3, 1], dim=1)
     _, near = nearest(position, position, min(N_NEIGHBOURS, len(position)))
     surprise = innovation[near, 0].nanmean(dim=1)
     drawn = axes.scatter(position[:, 0], position[:, 1], s=10, c=surprise, cmap="viridis", vmin=0)
-    figures.colour_bar(axes, drawn, f"mean innovation of the {N_NEIGHBOURS} nearest measurements")
-    caption = "Positions from above, coloured by their innovations."
+    figures.colour_bar(axes, drawn, f"{SURPRISE}, mean of the {N_NEIGHBOURS} nearest")
+    caption = f"Positions from above, coloured by the error relative to the expected one. {MEANING}"
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     return Plot("changes", [figure], caption, shown.assign(innovation=surprise.numpy()))
 

@@ -25,12 +25,12 @@ from tasks.configs import TABLE_SUFFIX, UpdateConfig
 from tasks.directory import Claim, begun, new_directory
 from tasks.environment import environment, invocation
 from tasks.options import by_name
-from tasks.page.page import write_page
+from tasks.page.page import REPORT, write_page
 from tasks.records import CONFIG, ENVIRONMENT, read_json
 from tasks.source import aligned, reading, with_groups
 from tasks.terminal import console, terminal
 from tasks.update.lines import OF_ROWS, answer, check_source, lines, measurement
-from tasks.update.record import SUMMARY, Record, page
+from tasks.update.record import SUMMARY, Record, next_step, page
 
 WAITING = "waiting"  # tensor of the spectra that a geometry has not learnt yet
 
@@ -64,9 +64,10 @@ def run(config: UpdateConfig) -> None:
     sentences = record.sentences()
     if follower.waiting is not None:
         sentences.append(
-            f"the last {len(follower.waiting)} spectra are not learnt: a room is refined at every 10 positions"
+            f"The last {len(follower.waiting)} spectra are not learnt: a room is refined at every 10 positions."
         )
-    terminal.page(record.summary(), "\n".join(sentences), Path(config.out) / "report.html")
+    lines = [*sentences, "", str(next_step(Path(config.out)))]
+    terminal.page(record.summary(), "\n".join(lines), Path(config.out) / REPORT)
 
 
 def follow(config: UpdateConfig) -> None:

@@ -36,7 +36,7 @@ FOLLOWED_COLUMNS = {
     "z_m": "z [m]",
     "error": "error",
     "running_error": "running error",
-    "innovation": "innovation",
+    "innovation": "error / expected error",
     "alarm": "alarm",
 }
 SHOW = """{

@@ -258,10 +258,7 @@ class RssiView:
                 widest = MAX_WIDTH_DB if self.unit == "dBm" else float(np.percentile(width, 99))
                 return ColouredMap(text, width, "magma", 0.0, widest, difference_unit(self.unit), "max")
             case "coverage":
-                text = (
-                    f"Coloured: {self._passing(selection)} with {selection.certainty:.0%} certainty. "
-                    f"{coverage_sentence(self.coverage(selection, counted=True).values)}"
-                )
+                text = coverage_sentence(self.coverage(selection, counted=True).values, self._passing(selection))
                 return ColouredMap(text, self.classes(selection).astype(float), CLASS_COLOURS, 0, len(CLASSES) - 1, "")
             case "best receiver":
                 first, part = next(iter(self.best(selection.height).items()))

@@ -292,4 +292,7 @@ def test_spectra_of_a_folder_are_learnt(tmp_path, capsys):
     (tmp_path / "new").mkdir()
     write_spectra(data().subset(torch.arange(N, N + M)), tmp_path / "new")
     assert quick.run("update", tmp_path / "model.safetensors", tmp_path / "new", "--out", tmp_path / "updated") == 0
-    assert f"{M} measurements learnt" in capsys.readouterr().out
+    *_, learnt, _, _, step, report = capsys.readouterr().out.splitlines()
+    assert f"{M} measurements learnt" in learnt
+    assert step.startswith("Continue with the updated model: swiftwrf update ")
+    assert report.startswith("report: ")

@@ -59,6 +59,7 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if not data.located:
         return None
     model = fit_path_loss(log_distance(data.transmitter_position, data.receiver_position), data.rssi_dbm, shared=True)
+    data = _by_floor(data)
     report = PathLossReport(_explained(data.transmitter_position, data), float(model.level), float(-model.slope / 10))
     data = data.columns(data.detected.sum(dim=0).argsort(descending=True, stable=True)[:20].tolist())
     walk, rows = data, some_rows(len(data), 2000)
@@ -84,6 +85,23 @@ def check_path_loss(data: Rssi) -> PathLossReport | None:
     if best >= max(MIN_EXPLAINED, 0.9 * attainable) and best - declared >= 0.1:
         return replace(report, explanation="; or if ".join(names))
     return replace(report, misplaced=attainable >= MIN_EXPLAINED and declared < attainable / 2)
+
+
+def _by_floor(data: Rssi) -> Rssi:
+    """Return RSSI with a column for each receiver and floor, whose level contains the attenuation between the floors."""
+    if data.floors is None:
+        return data
+    number = data.floors.number(data.transmitter_position)[:, None]
+    on = [data.rssi_dbm.where(number == floor, torch.nan) for floor in number.unique()]
+    names = [f"{name}, {floor}" for floor in range(len(on)) for name in data.receiver_names]
+    split = Rssi(
+        torch.cat(on, dim=1),
+        data.transmitter_position,
+        receiver_position=data.receiver_position.repeat(len(on), 1),
+        receiver_names=names,
+        time=data.time,
+    )
+    return split.columns((split.detected.sum(dim=0) >= MIN_TRAINING).nonzero()[:, 0].tolist() or [0])
 
 
 def best_scale(position: Tensor, score: Callable[[Tensor], float]) -> tuple[str, Tensor]:

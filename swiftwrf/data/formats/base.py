@@ -201,7 +201,7 @@ def _held(source: Path) -> str:
     if len(archives) != 1 or not (names := array_names(archives[0])):
         return ""
     held = f"{archives[0].name} holds {listed(sorted(names))}"
-    return f"; {held}: if it has array snapshots, name csi, position, ... with arrays"
+    return f"; {held}: if it has array snapshots, give --arrays csi=NAME position=NAME ..."
 
 
 def read_spectra(path: str | Path, options: ReadOptions) -> Spectra:

@@ -75,7 +75,7 @@ def test_answer_report_and_page_have_the_bands(run, capsys, tmp_path):
     assert sentence in page
     view, height = open_source(run), 0.0
     shown = view.coloured(MapSelection("coverage", 0, height, -67.0, at_least=1, band="5 GHz"))
-    assert shown.sentence.startswith("Coloured: one of 2 receivers of 5 GHz above -67 dBm with 90% certainty.")
+    assert "is covered (one of 2 receivers of 5 GHz above -67 dBm with at least 90% probability)" in shown.sentence
     counted = (RSSI[:, GHZ == "5 GHz"] > -67).any(axis=1)[load_rssi(run.parent / "walk.csv").split()[0].index]
     assert f"{counted.mean():.0%} of the {len(counted)} scans pass" in shown.sentence
 

@@ -87,7 +87,7 @@ def test_answer_and_report_have_the_unit_and_the_direction(run, tmp_path, capsys
 def test_the_page_shows_the_quantity(run):
     view, selection = open_source(run), MapSelection("coverage", 1, 0.0, 50.0)
     assert (view.threshold, view.unit, view.direction) == (50.0, "ms", "below")
-    assert view.coloured(selection).sentence.startswith("Coloured: west below 50 ms with 90% certainty.")
+    assert view.coloured(selection).sentence.count("(west below 50 ms with at least 90% probability)") == 1
     found = view.model.predict(np.array([[5.0, 5.0, 0.0]]))
     best = GATEWAYS[int(found.mean[0].argmin())]
     assert f"best receiver: {best}, {found.mean[0].min():.1f} ms" in view.describe(selection, 5.0, 5.0)

@@ -207,10 +207,10 @@ def test_where_the_best_server_is_uncertain_is_where_to_measure(tmp_path):
     run = made_run(tmp_path, **fields, receiver_names=np.array(["a", "b"]), receiver=np.full((2, 3), np.nan))
     assert width.mean(axis=1).max() == width.mean(axis=1).min()
     sentence = (
-        "Measure around x = 3.0 m, y = 2.0 m (14 dB instead of 9 dB): the 80% interval of the best server is widest"
+        "Measure around x = 3.0 m, y = 2.0 m (14 dB instead of 9 dB): the 80% interval of the best receiver is widest"
     )
     assert where_next(run).startswith(sentence)
-    assert [ax.get_title() for panel in Maps(run).summary().panels for ax in panel.axes[:1]] == ["best server"] * 2
+    assert [ax.get_title() for panel in Maps(run).summary().panels for ax in panel.axes[:1]] == ["best receiver"] * 2
     run.maps["inside"] = run.maps["inside"] & (np.arange(5) < 3)  # x = 3 is outside now
     assert "4 are too few" in where_next(run)
     assert "about 9 dB in the whole measured area" in Maps(run).summary().caption
@@ -298,7 +298,7 @@ def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
 
 def test_a_measured_area_without_cells_has_no_coverage(tmp_path):
     found = {"covered": None, "not_covered": None, "uncertain": None, "not_measured": None, "scans_above": None}
-    assert coverage_sentence(found) == "No cell of the map is in the measured area."
+    assert coverage_sentence(found, "a above -75 dBm") == "No cell of the map is in the measured area."
 
 
 @pytest.mark.parametrize("seed", [0, 1])

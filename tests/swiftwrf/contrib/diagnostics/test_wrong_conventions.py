@@ -13,6 +13,7 @@ from swiftwrf import AngularGrid, rssi_room
 from swiftwrf.contrib.diagnostics.inspection import inspect
 from swiftwrf.contrib.diagnostics.path_loss import check_path_loss
 from swiftwrf.data import Rssi
+from swiftwrf.data.coordinates import Floors
 from swiftwrf.data.store import Store
 
 GRID = AngularGrid.hemisphere(24, 96)
@@ -169,3 +170,18 @@ def test_a_delay_between_positions_and_rssi_of_a_walk_is_named(late, words):
     explanation = check_path_loss(walk).explanation
     assert explanation.endswith(words)
     assert bool(explanation) == bool(words)
+
+
+def test_the_attenuation_between_floors_is_no_error_of_the_frame():
+    """It was a scale of 260 units in a metre, which leaves the heights alone to explain RSSI. A swap is still named."""
+    upper = torch.arange(len(ROOM)) % 3 == 0
+    position, rssi = ROOM.transmitter_position.clone(), ROOM.rssi_dbm[:, [0, 3, 6, 9]].clone()
+    position[upper, 2] += 4
+    rssi[upper] -= 15
+    rssi[upper, 3] = torch.nan  # not received upstairs
+    on = ROOM.columns([0, 3, 6, 9])
+    building = replace(on, transmitter_position=position, rssi_dbm=rssi, floors=Floors(("0", "1"), (1.2, 5.2)))
+    report = check_path_loss(building)
+    assert (report.explanation, report.misplaced) == ("", False)
+    swapped = check_path_loss(replace(building, transmitter_position=position[:, [1, 0, 2]]))
+    assert "x and y of the positions are swapped" in swapped.explanation
