@@ -31,7 +31,8 @@ from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, DetectionField
 from swiftwrf.rssi.maps import RssiMap
 from swiftwrf.rssi.path_loss import PathLoss, log_distance
-from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, held_out_std, predictive_std
+from swiftwrf.rssi.posterior import RssiPosterior, held_out_std, predictive_std
+from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.scans import choose_correlation
 from swiftwrf.rssi.training import RssiTraining, prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved

@@ -23,7 +23,7 @@ from swiftwrf.rssi.base import Map, columns_of, often_detected
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.model import RssiModel
-from swiftwrf.rssi.regression import RssiPosterior, held_out_std
+from swiftwrf.rssi.posterior import RssiPosterior, held_out_std
 from swiftwrf.rssi.training import Bins, check_folds, choose_residual_kernels, prior_std
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import single_thread

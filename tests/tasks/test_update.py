@@ -183,7 +183,7 @@ def test_rssi_is_updated_after_loading_and_beyond_its_rows_in_memory(tmp_path, m
     expected = model.update(rest).predict(at).mean
     loaded = load(tmp_path / "model.safetensors").update(rest)  # the robust weights of the first rows are fixed
     torch.testing.assert_close(loaded.predict(at).mean, expected, atol=0.2, rtol=0)
-    monkeypatch.setattr("swiftwrf.rssi.regression.MAX_NEW_ROWS", 12)
+    monkeypatch.setattr("swiftwrf.rssi.posterior.MAX_NEW_ROWS", 12)
     torch.testing.assert_close(model.update(rest).predict(at).mean, expected, atol=0.2, rtol=0)
 
 

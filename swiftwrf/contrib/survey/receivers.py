@@ -34,7 +34,7 @@ from swiftwrf.positions import inside
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.offsets import FloorAttenuation, estimate_floor_attenuation
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_losses, log_distance
-from swiftwrf.rssi.regression import regressors
+from swiftwrf.rssi.posterior import regressors
 from swiftwrf.rssi.training import Bins, choose_residual_kernels, prior_std
 from swiftwrf.runtime.threads import parallel_map
 from swiftwrf.runtime.validation import checked

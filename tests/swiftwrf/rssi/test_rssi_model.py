@@ -22,7 +22,8 @@ from swiftwrf.rssi import RssiConfig, RssiPaperModel, compare
 from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.head import Head, Heads, mean_magnitude, render
 from swiftwrf.rssi.path_loss import PathLoss, PathLosses, fit_path_loss, fit_path_losses, log_distance
-from swiftwrf.rssi.regression import RssiPosterior, fit_receiver, regressors
+from swiftwrf.rssi.posterior import RssiPosterior, regressors
+from swiftwrf.rssi.regression import fit_receiver
 from swiftwrf.rssi.training import Bins, RssiTraining, choose_residual_kernels, rough_candidates
 from swiftwrf.runtime.digest import computed_once
 
