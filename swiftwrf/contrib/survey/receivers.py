@@ -248,7 +248,7 @@ class SharedPathLoss:
             receiver: Positions of the receivers, of which most are estimates.
             spread_db: Prior standard deviation of `fit_path_losses`. With 6 dB the mean error of 72 positions on six
                 simulated floors is 0.92 m for 0.86 m. 80 % intervals of the coverage of a further receiver on 18 floors hold
-                85 % with 2 dB and 88 % with 3 dB, and those of receivers that are left out of measured sets 76 % with 2 dB.
+                85 % with 2 dB and 88 % with 3 dB. Those of receivers that are left out of measured sets hold 76 % with 2 dB.
             noises: Compared variances of a measurement relative to that of the field. Smaller ones explain errors of the
                 positions by the field: with 0.03 and 0.1, too, the weight of the likelihood is 0.45 for 0.67, and 80 %
                 regions hold 56 of 58 receivers for 53 (`benchmarks/survey.py receivers`).

@@ -99,7 +99,7 @@ def test_an_archive_of_another_name_is_read_and_an_unknown_one_is_described(tmp_
     unknown.mkdir()
     np.savez(unknown / "monday.npz", **{"H" if name == "csi" else name: values for name, values in known.items()})
     for source in (unknown, unknown / "monday.npz"):
-        with pytest.raises(InputError, match=r"holds H, array_orientation, .* give --arrays csi=NAME"):
+        with pytest.raises(InputError, match=r"H, array_orientation, .* give --arrays csi=NAME"):
             swiftwrf.load_snapshots(source)
 
 
