@@ -10,7 +10,7 @@ import csv
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,7 @@ from rasterize import (
 from record import RESULTS, options, write_result
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from augment import Mixed
 from augment.estimators.aann import AANN, AANNConfig
@@ -48,6 +49,7 @@ from tasks.environment import choose_device
 
 FORWARD = {10_000: (600e3, 1e6), 1000: (1.8e6, 1.8e6)}  # by N: spectra a second that drawing should reach, and the goal
 WITH_GRADIENTS = {1000: (600e3, 600e3)}
+WITHOUT_KERNEL = ("aten::empty.memory_format", "aten::detach")  # besides views
 END_TO_END = 0.8  # of the rate of drawing alone
 COUNTERS = {  # of Nsight Compute: shares of the peak [%]
     "issue": "sm__inst_issued.avg.pct_of_peak_sustained_elapsed",
@@ -60,8 +62,8 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Config:
-    part: tyro.conf.Positional[Literal["rates", "training", "profile", "draw"]]
-    """what to measure; draw measures nothing and is what a profiler looks at"""
+    part: tyro.conf.Positional[Literal["rates", "training", "profile", "launches", "draw"]]
+    """what to measure; launches needs no GPU; draw measures nothing and is what a profiler looks at"""
     out: Path = RESULTS
     """folder of the result"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -225,6 +227,35 @@ def counters(config: Config, device: torch.device) -> Row | str:
     return {name: values.get(metric) for name, metric in COUNTERS.items()}
 
 
+class Launches(TorchDispatchMode):
+    """Count of the operations that compute, each of which is a kernel or more on a GPU; views are none."""
+
+    count = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        self.count += not (func.is_view or func.name() in WITHOUT_KERNEL)
+        return func(*args, **kwargs or {})
+
+
+def launches(config: Config, device: torch.device) -> Row:
+    """Return the number of operations around the rasterizer of a call for one batch, which no batch size changes."""
+    grid, (n, *_), _ = sizes(config)
+    model, found = model_of(n, grid, device), dict[str, int]()
+    for batch in (8, 16):
+        position = positions(batch)
+        calls = {
+            "model": partial(rendered, model, position.to(device), grid),
+            "synthesize": partial(model.synthesize, position),
+        }
+        for name, call in calls.items():
+            with torch.no_grad(), Launches() as counter:
+                call()
+            assert found.setdefault(name, counter.count) == counter.count, "the count depends on the batch"
+    return {"operations": found}
+
+
 def draw(config: Config, device: torch.device) -> None:
     """The largest scene, three times."""
     grid, numbers, batches = sizes(config)
@@ -237,6 +268,7 @@ PARTS = {
     "rates": rates,
     "training": training,
     "profile": profiled,
+    "launches": launches,
     "draw": draw,
 }
 
