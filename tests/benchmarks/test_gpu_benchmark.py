@@ -15,7 +15,7 @@ from swiftwrf.models import swiftwrf
 SCRIPT = Path(gpu.__file__).with_name("gpu.sh")
 
 
-@pytest.mark.parametrize("part", ["rates", "training", "profile"])
+@pytest.mark.parametrize("part", ["rates", "training", "profile", "launches"])
 def test_every_part_leaves_its_result(part, tmp_path, monkeypatch):
     monkeypatch.setattr(swiftwrf, "CUTOFF", swiftwrf.CUTOFF)  # the benchmark sets another one
     gpu.main(gpu.Config(part, tmp_path, "cpu", quick=True, seconds=0.01))
@@ -31,6 +31,8 @@ def test_every_part_leaves_its_result(part, tmp_path, monkeypatch):
             assert all(0 < rate["low"] <= rate["median"] <= rate["high"] for rate in rates)
         case "training":
             assert len(found["seconds"]) == 3
+        case "launches":
+            assert 10 < found["operations"] < 100
         case "profile":
             assert found["counters"] == "no GPU"
             for row in found["rows"]:
