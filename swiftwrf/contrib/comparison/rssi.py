@@ -297,9 +297,8 @@ def compare(
         >>> bool(result.summary().loc["swiftwrf", "median"] < result.summary().loc["mean", "median"])
         True
     """
-    given = {
-        name: value for name, value in locals().items() if name not in ("above", "below", "rooms")
-    }  # which change no step
+    # all but what changes no step
+    given = {name: value for name, value in locals().items() if name not in ("above", "below", "rooms")}
     if below and (above or data.is_power):
         raise InputError("below is for another quantity than RSSI, e.g. latency, in place of above; use above")
     chosen = data.as_measured().receivers(receivers)
@@ -384,19 +383,8 @@ def compare(
         return float((predictor.predict_detected(asked).mean - asked.rssi_dbm)[asked.detected].abs().mean())
 
     def repeat(_: None, folder: Path, number: int) -> Values:
-        again = compare(
-            data,
-            receivers=receivers,
-            split=split,
-            seed=seed + number,
-            also=also,
-            preset=preset,
-            reference=reference,
-            not_detected=not_detected,
-            validation=validation,
-            device=device,
-            executor=executor,
-        )
+        once: Values = {"seed": seed + number, "repeats": 1, "fewer": (), "keep": None, "progress": False}
+        again = compare(**given | once)
         return {name: {"median": found["median"], "mean": found["mean"]} for name, found in again.values.items()}
 
     memo = keep or Memo()

@@ -114,6 +114,12 @@ def test_models_of_power_are_refused(tmp_path):
         model.update(swiftwrf.rssi_room(n=20).columns([0]))
 
 
+def test_repeats_compare_the_named_predictors_only():
+    result = swiftwrf.rssi.compare(read(), only=["knn"], repeats=2)
+    assert set(result.values) == set(result.repeats["method"]) == {"swiftwrf", "mean", "knn"}
+    assert result.repeats["method"].value_counts().tolist() == [2, 2, 2]
+
+
 def test_repeats_are_comparisons_of_other_seeds():
     """Mean and standard deviation over splits, in the summary, the recorded values and the answer."""
     data = read()
