@@ -65,7 +65,7 @@ def run(config: InspectConfig) -> None:
         found = page(findings, kind, config, _kept(config, how, folder, out))
         write_page(folder, found)
     first, *_ = found.summary.conclusion
-    steps = "\n".join(f"{step.text}: {step.code}" for step in found.summary.next_steps)
+    steps = "\n".join(map(str, found.summary.next_steps))
     terminal.page(content, f"{config.source}: {kind}. {first}\n\n{findings}\n\n{steps}", out / "report.html")
 
 

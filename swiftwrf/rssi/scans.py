@@ -44,8 +44,8 @@ def at_least(
         std: Their standard deviation (R, ...) [dB].
         detection: Probability of a detection (R, ...).
         threshold_dbm: Threshold.
-        below: True where smaller is better: probability of values below the threshold.
         correlation: Correlation of the errors of a scan, as `choose_correlation` finds it.
+        below: True where smaller is better: probability of values below the threshold.
 
     Example:
         >>> at_least(1, torch.tensor([-75.0]), torch.tensor([4.0]), torch.tensor([0.8]), -75.0).round(decimals=3)
