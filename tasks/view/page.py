@@ -21,7 +21,7 @@ from swiftwrf import InputError
 from tasks.environment import command
 from tasks.page.maps import Corners
 from tasks.records import rounded
-from tasks.update.record import FollowedView, Version, snapshot
+from tasks.update.record import SURPRISE, FollowedView, Version, snapshot
 from tasks.view.charts import Data, Option, axis, circle, crosses, lines, paths, points
 from tasks.view.locating import Located
 
@@ -36,7 +36,7 @@ FOLLOWED_COLUMNS = {
     "z_m": "z [m]",
     "error": "error",
     "running_error": "running error",
-    "innovation": "error / expected error",
+    "innovation": SURPRISE,
     "alarm": "alarm",
 }
 SHOW = """{
