@@ -5,6 +5,10 @@ so it is not repeated in every fold. No fold is predicted with a structure that 
 out folds 0 and 1, another leaves out folds 2 and 3. A model reuses the structure of the search that left its fold out, and
 fits its parameters to all other folds. Fold 4 takes part in both searches and is never predicted. If a search without two
 folds had too few spectra, each fold has a separate search.
+
+Turbo learning gives rooms instead, one for each pair of folds. A search of all measured spectra finds their planes once. The
+spectra outside the pair decide which planes exist, where, and what stands among them (`GeometryModel.decided_on`).
+`benchmarks/held_out_rooms.py` measures what that shares.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from augment.positions import Count
 from augment.turbo.condition import CHOSEN, LOCATED, NETWORKS, Condition, MeasuredSubset, Row, Training
 from augment.turbo.experiment import ROOM_MODEL, Experiment
 from augment.turbo.results import TurboResult
-from augment.turbo.stages import compare, evaluate, find_room, hold_out, locate, synthesize
+from augment.turbo.stages import compare, decide_room, evaluate, find_room, hold_out, locate, synthesize
 from swiftwrf.contrib.comparison.steps import Memo, Steps
 from swiftwrf.data import Spectra
 from swiftwrf.models import FieldModel
@@ -152,7 +152,7 @@ class _Learning:
         self.compares = bool(self.fast or not experiment.named)
         self.searches = ROOM_MODEL in experiment.candidates
         self.parts = experiment.parts(subset) if subset.repeat == 0 else []
-        # the subset without the folds that a search for a room leaves out
+        # the subset without folds that the room in it takes no notice of
         self.blind = self.parts if self.searches else []
         compared = [*experiment.candidates, *(self.fast or candidates(experiment.train))]
         if self.compares and any(map(experiment.finds_room, compared)):
@@ -164,6 +164,8 @@ class _Learning:
         Yield before each wait for values, so that other subsets start their steps.
         """
         self.begin()
+        yield
+        self.decide_rooms()
         yield
         self.use_rooms()
         yield
@@ -225,23 +227,27 @@ class _Learning:
             self.steps.start(name, title, hold_out, self.subset, repeated, rooms, first=first.is_turbo)
         )
 
-    def find(self, subset: MeasuredSubset | None = None) -> str:
-        """Start the search for the room in the measured spectra, or in those of a subset of them; return its name."""
-        subset = subset or self.subset
-        title = "finding the room"
-        if subset in self.blind:
-            title += f" without held-out spectra, {self.blind.index(subset) + 1} of {len(self.blind)}"
-        return self.steps.start(f"room-{subset}", self.titled(title), find_room, subset, first=True)
+    def find(self) -> str:
+        """Start the search for the room in the measured spectra; return its name."""
+        return self.steps.start(
+            f"room-{self.subset}", self.titled("finding the room"), find_room, self.subset, first=True
+        )
+
+    def decide(self, part: MeasuredSubset) -> str:
+        """Start the decision, without held-out spectra, which planes of the room exist; return its name."""
+        title = (
+            f"deciding without held-out spectra what is in the room, {self.blind.index(part) + 1} of {len(self.blind)}"
+        )
+        room = self.steps[self.find()]
+        return self.steps.start(f"room-{part}", self.titled(title), decide_room, part, room, first=True)
 
     def room_of(self, part: MeasuredSubset) -> str:
-        """Return the name of a search without the spectra that a part holds out."""
-        return self.find(next(blind for blind in self.blind if set(part.without) <= set(blind.without)))
+        """Return the name of a decision without the spectra that a part holds out."""
+        return self.decide(next(blind for blind in self.blind if set(part.without) <= set(blind.without)))
 
     def begin(self) -> None:
-        """From the measured spectra alone: find the room, with and without held-out folds, and train references."""
-        for part in self.blind:
-            self.find(part)
-        if self.searches:
+        """From the measured spectra alone: find the room, and train references."""
+        if self.blind or self.searches:
             self.find()
         experiment = self.experiment
         usable = [name for name in experiment.evaluated if name not in experiment.lacking]
@@ -249,10 +255,15 @@ class _Learning:
         self.full = [self.train(name, "all measured") for name in experiment.trainable]
         self.hold(self.conditions)
 
+    def decide_rooms(self) -> None:
+        """Decide without each of the held-out folds what is in the room."""
+        for part in self.blind:
+            self.decide(part)
+
     def use_rooms(self) -> None:
         """Compare field models, and locate held-out spectra and test spectra by the room."""
         if self.compares:
-            rooms = [self.steps[self.find(part)] for part in self.blind]
+            rooms = [self.steps[self.decide(part)] for part in self.blind]
             title = self.titled("comparing field models")
             self.steps.start(self.choice, title, compare, self.subset, self.fast, rooms, first=True)
         if self.searches and all(self.steps[self.room_of(part)].get("planes") for part in self.parts):

@@ -49,7 +49,7 @@ def compare(experiment: Experiment, folder: Path, subset: MeasuredSubset, compar
         folder: Folder of the files.
         subset: Measured spectra.
         compared: Names of field models. Empty for all that are fast and whose requirements the data meet.
-        rooms: Results of `find_room` without the folds that are predicted.
+        rooms: Results of `decide_room` without the folds that are predicted.
     """
     measured, _ = experiment.withhold(subset)
     seed = experiment.seed + subset.repeat
@@ -83,7 +83,7 @@ def hold_out(
         folder: Folder of the files.
         subset: Measured spectra, whose `parts` hold some out.
         conditions: Conditions with one field model, or without any.
-        rooms: Results of `find_room` for the parts, if the field model or the locator is built on a room.
+        rooms: Results of `decide_room` for the parts, if the field model or the locator is built on a room.
     """
     seed, synthesizer = experiment.seed + subset.repeat, conditions[0].synthesizer
     extra = min(max(condition.n_synthetic for condition in conditions), MAX_HELD_OUT_EXTRA)
@@ -122,12 +122,33 @@ def find_room(experiment: Experiment, folder: Path, subset: MeasuredSubset) -> R
     Args:
         experiment: Data and options.
         folder: Folder of the files.
-        subset: Measured spectra, of which some may be held out.
+        subset: Measured spectra.
     """
+    model = experiment.make_model(ROOM_MODEL, subset.repeat)
+    return _keep_room(experiment, folder, subset, partial(model.fit, device=experiment.device, progress=True))
+
+
+def decide_room(experiment: Experiment, folder: Path, subset: MeasuredSubset, room: Row) -> Row:
+    """Decide without held-out spectra which planes of the room exist, where, and what stands in it.
+
+    Args:
+        experiment: Data and options.
+        folder: Folder of the files.
+        subset: Measured spectra, of which some are held out.
+        room: Result of `find_room` with all of them.
+    """
+    return (
+        _keep_room(experiment, folder, subset, _read_room(folder, room["file"]).decided_on) if "file" in room else room
+    )
+
+
+def _keep_room(
+    experiment: Experiment, folder: Path, subset: MeasuredSubset, room_of: Callable[[Spectra], FieldModel]
+) -> Row:
     measured, _ = experiment.withhold(subset)
     began = time.perf_counter()
     try:
-        model = experiment.make_model(ROOM_MODEL, subset.repeat).fit(measured, device=experiment.device, progress=True)
+        model = room_of(measured)
     except (InputError, FitError) as error:
         return {"refused": str(error)}
     file = _file(f"room-{subset}")

@@ -140,6 +140,29 @@ def refine_room(room: RoomEstimate, train: Spectra, config: GeometryConfig) -> R
 
 
 @single_thread()
+def decided_room(room: RoomEstimate, train: Spectra, config: GeometryConfig) -> RoomEstimate:
+    """Decide by other spectra of the scene which planes of a room exist, without a search, and refine these.
+
+    Offsets, gains, scores and conclusion are those of these spectra. As in a search, a plane is dropped if it hardly
+    reflects or does not explain held-out spectra significantly better. The highest order of an image source remains.
+
+    Args:
+        room: Planes that may exist.
+        train: Spectra with array, rotation and fixed end.
+        config: Options of the search.
+
+    Raises:
+        InputError: As `search_room`.
+    """
+    scene, _ = observe(train, config)
+    assert train.array is not None
+    splits = split(scene, folds(scene.moving, config.validation, config.seed))
+    found = _pruned(refine(scene, plane_set(room.planes, room.order)), scene, splits, config)
+    (kept, held), *_ = splits
+    score = correlation_score(held, refine(kept, found), train.array)
+    return assess(train, scene, refine(scene, found), score, searched=False)
+
+
 def widened_room(room: RoomEstimate, planes: list[Plane], train: Spectra, config: GeometryConfig) -> RoomEstimate:
     """Add known planes to a room, of which those stay that explain held-out spectra significantly better.
 
@@ -152,15 +175,8 @@ def widened_room(room: RoomEstimate, planes: list[Plane], train: Spectra, config
     Raises:
         InputError: As `search_room`.
     """
-    scene, _ = observe(train, config)
-    assert train.array is not None
-    splits = split(scene, folds(scene.moving, config.validation, config.seed))
-    found = _pruned(refine(scene, plane_set([*room.planes, *planes], room.order)), scene, splits, config)
-    if found.normal.shape[1] <= len(room.planes):
-        return room
-    (kept, held), *_ = splits
-    score = correlation_score(held, refine(kept, found), train.array)
-    return assess(train, scene, refine(scene, found), score, searched=False)
+    found = decided_room(replace(room, planes=[*room.planes, *planes]), train, config)
+    return found if len(found.planes) > len(room.planes) else room
 
 
 def update_room(room: RoomEstimate, new: Spectra, config: GeometryConfig) -> RoomEstimate:

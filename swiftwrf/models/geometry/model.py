@@ -20,7 +20,7 @@ from swiftwrf.data.splits import folds
 from swiftwrf.errors import InputError
 from swiftwrf.models.base import ARRAY, FIXED_END, FieldModel, bounding_box
 from swiftwrf.models.geometry.channels import Channels, superposed, waves
-from swiftwrf.models.geometry.fit import GeometryConfig, refine_room, search_room, update_room
+from swiftwrf.models.geometry.fit import GeometryConfig, decided_room, refine_room, search_room, update_room
 from swiftwrf.models.geometry.furniture import Furniture, find_furniture, fit_furniture, orders
 from swiftwrf.models.geometry.images import LinkAt, PhaseObservations, PlaneSet, Sequence, images, mirror
 from swiftwrf.models.geometry.planes import Plane, RoomEstimate, plane_set, refine
@@ -114,6 +114,29 @@ class GeometryModel(Linked, FieldModel):
             measured, fold = self.channels(train), folds(train.position, self.config.validation, self.config.seed)
             free = self.gains(measured.scene)
             self.furniture = find_furniture(self.tensors(), free, measured, self.region(), fold)
+
+    def decided_on(self, train: Spectra) -> Self:
+        """Return the room with those of its planes that other spectra show, and what these show to stand in it.
+
+        The search took all spectra to find the planes; what held-out spectra are predicted with is decided without them.
+
+        Args:
+            train: Spectra of the same link, usually a part of those that the room was found in.
+
+        Raises:
+            InputError: As `search_room`, or spectra of another link.
+
+        Example:
+            >>> import swiftwrf
+            >>> room = swiftwrf.simulated_room(n=50)
+            >>> model = GeometryModel.of_planes(room, [Plane((0.0, 0.0, -1.0), offset_m=0.0, gain=-0.6)])
+            >>> len(model.decided_on(room[:30]).planes)
+            1
+        """
+        train, model = self.link.aligned(train), copy(self)
+        model.estimate, model.fingerprint = decided_room(self.estimate, train, self.config), fingerprint(train)
+        model.furnish(train)
+        return model
 
     def furnished_on(self, train: Spectra) -> Self:
         """Return the room with its furniture fitted to the channels of other spectra, without another choice of options."""

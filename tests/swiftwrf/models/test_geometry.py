@@ -374,6 +374,18 @@ def test_a_room_on_other_spectra_has_their_uncertainty_and_scores(room):
     assert found.conclusion == f"6 planes, {certain} of them identifiable"
 
 
+def test_other_spectra_decide_which_planes_of_a_room_exist():
+    """Of six planes that stand a centimetre off, two of which are not there, the other four remain, at their places."""
+    real = {normal: offset for normal, offset in SIX.items() if normal[1] == 0}
+    data = mirror_room(real, 4 * (-0.6,), n=40, noise=0.1)
+    moved = [Plane(normal, offset + 0.01, gain=-0.5) for normal, offset in SIX.items()]
+    found = GeometryModel.of_planes(data, moved).decided_on(data[:30])
+    assert {plane.normal for plane in found.planes} == set(real)
+    assert max(error for error, _ in errors(found, real)) < 3
+    nothing = mirror_room({}, n=20, noise=0.3)
+    assert found.decided_on(nothing).conclusion == "no plane explains the spectra"
+
+
 def test_an_update_multiplies_the_odds_of_each_plane(room):
     other = mirror_room(SIX, n=20, noise=0.3, seed=3)
     own = GeometryModel().fit(other, like=room)
