@@ -41,7 +41,15 @@ COMMANDS = {
     "view": Command("ViewConfig", "tasks.view.sources"),
 }
 # modules that processes of a run load while the run itself begins
-PRELOADED = {"aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo")}
+DRAWING = ("tasks.page.figures",)
+PRELOADED = {
+    "aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo", *DRAWING),
+    "rssi": ("swiftwrf.contrib.comparison.rssi", *DRAWING),
+    "locate": ("swiftwrf.contrib.comparison.locating", *DRAWING),
+    "plan": DRAWING,
+    "report": DRAWING,
+    "update": DRAWING,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

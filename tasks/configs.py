@@ -26,7 +26,24 @@ TABLE_SUFFIX = ".csv"  # suffix of a followed table; other followed files are JS
 
 
 @options
-class AoaConfig(ReadingConfig):
+class StepsConfig(ReadingConfig):
+    """Options of a command whose steps may be computed side by side."""
+
+    _: KW_ONLY
+    scheduler: str | None = None
+    """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
+    processes: PositiveInt | None = None
+    """processes of this machine that compute the steps, a gigabyte of memory each (default: one a thread, at most 4; one on
+    a GPU)"""
+
+    def check(self) -> None:
+        super().check()
+        if self.processes is not None and self.scheduler is not None:
+            raise InputError("--processes and --scheduler exclude each other; leave out one")
+
+
+@options
+class AoaConfig(StepsConfig):
     """Estimate angles of arrival with few measured spectra, and report the errors.
 
     Turbo learning is compared with its references and baselines. Without --data the built-in simulated room is used.
@@ -71,11 +88,6 @@ class AoaConfig(ReadingConfig):
     """quick: sized for a CPU; paper: the paper's model, network and measured fractions, and a long training, for a GPU"""
     repeats: PositiveInt = 1
     """runs with different measured spectra and networks, pooled"""
-    scheduler: str | None = None
-    """address of a Dask scheduler whose workers compute the steps of the run (extra: cluster)"""
-    processes: PositiveInt | None = None
-    """processes of this machine that compute the steps, a gigabyte of memory each (default: one a thread, at most 4; one on
-    a GPU)"""
     seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
@@ -112,8 +124,6 @@ class AoaConfig(ReadingConfig):
         if len(set(self.measured)) < len(self.measured):
             raise InputError(f"--measured names a fraction twice: {given_mix}")
         self.check_read()
-        if self.processes is not None and self.scheduler is not None:
-            raise InputError("--processes and --scheduler exclude each other; leave out one")
         check_repeats(self.seed, self.repeats)
 
 
@@ -128,7 +138,7 @@ def check_repeats(seed: int, repeats: int) -> None:
 
 
 @options
-class FloorPlanConfig(ReadingConfig):
+class FloorPlanConfig(StepsConfig):
     """Options of a command whose maps lie on an image of the floor."""
 
     _: KW_ONLY
@@ -189,8 +199,6 @@ class RssiTaskConfig(FloorPlanConfig):
     """number of positions to suggest for the next measurements, those that make the coverage more certain"""
     repeats: PositiveInt = 1
     """number of random splits, over which errors have a mean and a standard deviation"""
-    scheduler: str | None = None
-    """address of a Dask scheduler whose workers fit groups of receivers (extra: cluster)"""
     seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
@@ -235,8 +243,6 @@ class LocateConfig(FloorPlanConfig):
     suggest: Annotated[int, Ge(0), Le(MAX_SUGGESTIONS)] = 0
     """number of positions to measure next that are suggested: where position errors are large and radio maps uncertain; of
     several antenna arrays, number of poses of a next array (at most 24)"""
-    scheduler: str | None = None
-    """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     seed: Seed = 0
     """seed of everything random"""
     out: str | None = None
@@ -483,7 +489,7 @@ class ResumeConfig(Options):
     scheduler: str | None = None
     """address of a Dask scheduler whose workers compute the steps (extra: cluster)"""
     processes: PositiveInt | None = None
-    """processes of this machine that compute the steps of aoa (default: one a thread, at most 4; one on a GPU)"""
+    """processes of this machine that compute the steps (default: one a thread, at most 4; one on a GPU)"""
 
     def check(self) -> None:
         super().check()

@@ -334,7 +334,8 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         Raises:
             InputError: As `aligned`.
         """
-        return self.predict(self.aligned(data).transmitter_position if isinstance(data, Rssi) else data)
+        at = self.aligned(data).transmitter_position if isinstance(data, Rssi) else data
+        return self._detected(self.predict(at), self._offset(data))
 
     @checked
     def predict_detection(self, position: Rssi | Numbers, offset_db: Tensor | float = 0.0) -> Tensor:
@@ -358,16 +359,33 @@ class RssiPredictor(Updatable, Configured, Displayed, ABC):
         if isinstance(position, Rssi):
             data = self.aligned(position)
             position, offset_db = data.transmitter_position, self._offset(data)
-        return self._detection_at(position, offset_db)
+        with torch.no_grad():
+            return self._detection(self.predict(position), offset_db)
+
+    def predict_packets(self, position: Numbers) -> tuple[Prediction, Prediction, Tensor]:
+        """Return what `predict`, `predict_detected` and `predict_detection` return at positions, from one prediction.
+
+        Example:
+            >>> import swiftwrf
+            >>> every, detected, _ = swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60)).predict_packets([[1.0, 2.0, 1.2]])
+            >>> bool((detected.mean >= every.mean).all())
+            True
+        """
+        with torch.no_grad():
+            prediction = self.predict(position)
+            return prediction, self._detected(prediction, 0.0), self._detection(prediction, 0.0)
 
     def _offset(self, data: Rssi | Numbers) -> Tensor | float:
         """Return the offset of each row of measurements relative to the reference, (n, 1) [dB]; 0 where there are none."""
         return 0.0 if self.offsets is None or not isinstance(data, Rssi) else self.offsets.of(data)[:, None]
 
-    def _detection_at(self, position: Numbers, offset_db: Tensor | float) -> Tensor:
-        """Return what `predict_detection` returns at positions."""
-        with torch.no_grad():
-            mean = self.predict(position).mean.double() + offset_db
+    def _detected(self, prediction: Prediction, offset_db: Tensor | float) -> Prediction:
+        """Return the prediction of detected packets from that of all packets."""
+        return prediction
+
+    def _detection(self, prediction: Prediction, offset_db: Tensor | float) -> Tensor:
+        """Return the probability of a detection from the prediction of all packets."""
+        mean = prediction.mean.double() + offset_db
         return torch.ones_like(mean) if self.detection is None else (mean > self.detection.limit).double()
 
     def _facts(self) -> dict[str, str]:

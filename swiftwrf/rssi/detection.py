@@ -16,7 +16,6 @@ from typing import Annotated, Self
 
 import numpy as np
 import torch
-from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
@@ -240,6 +239,8 @@ class DetectionField:
         feature = torch.stack([(level - limit) / 10, nearby], dim=-1)
         kinds, order = detected.flatten().sort(stable=True)  # the first and the last cell, one of each kind, are kept
         some, kinds = subsample(feature.flatten(0, 1)[order], kinds, rows=80_000)
+        from sklearn.linear_model import LogisticRegression  # takes half a second, which only a fit needs
+
         regression = LogisticRegression(C=100.0).fit(some.numpy(), kinds.numpy())
         weight = torch.tensor([*regression.intercept_, *regression.coef_[0]], dtype=torch.float64)
         odds = weight[0] + feature @ weight[1:]

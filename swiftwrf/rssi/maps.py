@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from swiftwrf.data.coordinates import GeodeticOrigin, degree_columns
 from swiftwrf.data.dataset import DEGREE_UNITS, Arrays, Labelled, Numbers
-from swiftwrf.data.rssi import Rssi, receiver_row
+from swiftwrf.data.rssi import receiver_row
 from swiftwrf.errors import InputError, listed
 from swiftwrf.models.prediction import Prediction, difference_unit, suffix
 from swiftwrf.plotting import Axes, Displayed, corners_of, hatch, plan_map
@@ -86,6 +86,24 @@ class RssiMap(Labelled, Displayed):
             >>> RssiMap.predict(model, cell=1.0).mean.shape
             (12, 15, 19)
         """
+        return cls.of_packets(model, cell, height, region)[detected]
+
+    @classmethod
+    def of_packets(
+        cls,
+        model: RssiPredictor,
+        cell: float | None = None,
+        height: float | None = None,
+        region: Numbers | None = None,
+    ) -> tuple[RssiMap, RssiMap]:
+        """Return the maps of all packets and of detected ones, from one prediction; arguments and errors as of `predict`.
+
+        Example:
+            >>> import swiftwrf
+            >>> every, detected = RssiMap.of_packets(swiftwrf.RssiModel().fit(swiftwrf.rssi_room(n=60)), cell=1.0)
+            >>> bool((detected.mean >= every.mean).all())
+            True
+        """
         known, receiver = model.region(), model.receiver_position
         if region is None:
             region = torch.cat([known, receiver[receiver.isfinite().all(dim=1)]])
@@ -108,22 +126,16 @@ class RssiMap(Labelled, Displayed):
         x, y = (start + cell * np.arange(int(size)) for start, size in zip(first, sizes, strict=True))
         z = float(known[:, 2].median()) if height is None else height
         grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), z)], axis=-1).reshape(-1, 3)
-        cells = Rssi(
-            np.full((len(grid), len(receiver)), np.nan),
-            grid,
-            receiver_position=receiver,
-            receiver_names=model.receiver_names,
-            origin=model.origin,
-            quantity=model.quantity,
-            unit=model.unit,
-        )
-        with torch.no_grad():
-            rssi = model.predict_detected(cells) if detected else model.predict(grid)
-        assert rssi.std is not None
-        fields = (rssi.mean, rssi.std, model.predict_detection(grid))
-        mean, std, detection = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in fields)
         about = model.receiver_names, model.origin, model.quantity, model.unit, model.scan_correlation
-        return cls(x, y, z, cell, mean, std, detection, *about)
+        every, detected, detection = model.predict_packets(grid)
+
+        def chart(prediction: Prediction) -> RssiMap:
+            assert prediction.std is not None
+            fields = (prediction.mean, prediction.std, detection)
+            mean, std, found = (values.T.reshape(-1, len(y), len(x)).float().numpy() for values in fields)
+            return cls(x, y, z, cell, mean, std, found, *about)
+
+        return chart(every), chart(detected)
 
     def receivers(self, asked: Sequence[str]) -> RssiMap:
         """Return the map of receivers by their names, or by numbers counted from 1.

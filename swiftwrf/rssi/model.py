@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from swiftwrf.data.dataset import Numbers
 from swiftwrf.data.rssi import Rssi
 from swiftwrf.data.splits import each_fold, places
 from swiftwrf.gp import Kernel, subsample
@@ -25,7 +24,6 @@ from swiftwrf.metrics import HALF_WIDTH, interval_factor
 from swiftwrf.models.base import CPU
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.plotting import Axes
-from swiftwrf.positions import check_positions
 from swiftwrf.rssi.base import Map, RssiPredictor, columns_of
 from swiftwrf.rssi.config import RssiConfig
 from swiftwrf.rssi.detection import Detection, DetectionField
@@ -38,7 +36,6 @@ from swiftwrf.rssi.training import RssiTraining, prepare, rounding_std
 from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.progress import progress_bar
 from swiftwrf.runtime.threads import parallel_map, single_thread
-from swiftwrf.runtime.validation import checked
 
 MAX_COMPARED = 12  # receivers with limits that both meanings are fitted to; more do not change the choice
 RECEIVERS_AT_ONCE = 64  # between two steps of the progress bar; starting threads costs milliseconds
@@ -252,33 +249,21 @@ class RssiModel(RssiPredictor, Saved):
         )
         return mean.float(), std.float()
 
-    @checked
-    def predict_detected(self, data: Rssi | Numbers) -> Prediction:
-        """Predict the RSSI of packets that are detected at the positions of the data; shapes as of `predict`.
-
-        Near the limit of detection it is above the received power of all packets, which `predict` returns.
-
-        Args:
-            data: Measurements, or positions of the transmitter, tensor or array (n, 3) [m].
-
-        Raises:
-            InputError: As `aligned`.
-        """
-        data = self.aligned(data) if isinstance(data, Rssi) else data
-        prediction = super().predict_detected(data)
+    def _detected(self, prediction: Prediction, offset_db: Tensor | float) -> Prediction:
+        """Return the prediction of detected packets: near the limit of detection it is above that of all packets."""
         if self.detection is None or self.detection_field is None:
             return prediction
         assert prediction.std is not None
-        offset = self._offset(data)
-        mean, std = self.detection.given_detection(prediction.mean.double() + offset, prediction.std.double())
-        return replace(prediction, mean=(mean - offset).float(), std=std.float())
+        level, std = prediction.mean.double() + offset_db, prediction.std.double()
+        mean, std = self.detection.given_detection(level, std)
+        return replace(prediction, mean=(mean - offset_db).float(), std=std.float())
 
-    def _detection_at(self, position: Numbers, offset_db: Tensor | float) -> Tensor:
+    def _detection(self, prediction: Prediction, offset_db: Tensor | float) -> Tensor:
         if self.detection_field is None:
-            return super()._detection_at(position, offset_db)
-        with torch.no_grad():
-            level = self.predict(position).mean.double() + offset_db
-        return self.detection_field.probability(level, check_positions(position) - self.centre)
+            return super()._detection(prediction, offset_db)
+        assert prediction.position is not None
+        level = prediction.mean.double() + offset_db
+        return self.detection_field.probability(level, prediction.position - self.centre)
 
     def plot(self, receiver: str | None = None, height_m: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the map of the predicted RSSI over the measured region, seen from above.

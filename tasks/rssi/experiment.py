@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from augment.suggest import suggest_scans
 from swiftwrf import Rssi, RssiModel, rssi_room
 from swiftwrf.contrib.comparison.predictors import compared
 from swiftwrf.contrib.comparison.rssi import RssiComparison, compare
@@ -52,7 +51,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
     with (
         connected(config.scheduler, device) as cluster,
-        Run("rssi", label, config, device, source, resume, described=described) as directory,
+        Run("rssi", label, config, device, source, resume, 1 if cluster else config.processes, described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(
@@ -74,6 +73,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
                 device=device,
                 keep=directory,
                 executor=workers,
+                parallel=cluster.map if cluster else None,
                 progress=True,
             )
         if result.train.offsets is not None:
@@ -92,6 +92,8 @@ def _suggest(result: RssiComparison, config: RssiTaskConfig, directory: Run) -> 
     model, train = result.predictors[result.model], result.train
     if not config.suggest or not isinstance(model, RssiModel):
         return
+    from augment.suggest import suggest_scans  # loads the locator, which only suggestions need
+
     found = suggest_scans(model, train, config.suggest, result.thresholds[0][0], result.is_below)
     if not is_worth(found.variance.numpy()):
         console.print(NOT_WORTH)

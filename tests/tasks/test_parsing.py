@@ -162,7 +162,7 @@ def test_an_option_given_twice_in_a_file_is_refused(tmp_path, name, text):
         executed(RssiTaskConfig, "--rx", 1, "--config", tmp_path / name)
 
 
-@pytest.mark.parametrize("given", [("--seed", "7"), ("--data", "x"), ("--processes", "2")])
+@pytest.mark.parametrize("given", [("--seed", "7"), ("--data", "x"), ("--split", "block")])
 def test_resume_changes_no_result(tmp_path, given, capsys):
     folder = tmp_path / "x.partial"
     folder.mkdir()

@@ -42,7 +42,7 @@ def test_processes_give_the_results_of_one_process_in_the_same_order(tmp_path):
 
 @pytest.mark.skipif(not SERVED, reason="processes are forks of a server on Linux alone")
 def test_processes_begin_with_the_modules_that_a_command_preloads():
-    assert set(map(import_module, PRELOADED["aoa"])) <= set(sys.modules.values())
+    assert all(set(map(import_module, modules)) <= set(sys.modules.values()) for modules in PRELOADED.values())
     code = """if __name__ == "__main__":
         from tasks.preload import preload, process_context
         preload(["colorsys"])

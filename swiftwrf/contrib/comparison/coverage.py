@@ -63,11 +63,10 @@ def maps_and_coverage(
         floors.number(rows.transmitter_position) if floors else torch.zeros(len(rows), dtype=torch.int64)
         for rows in (train, test)
     )
-    charts = [RssiMap.predict(model, height=height) for height in heights]
+    charts = [RssiMap.of_packets(model, height=height) for height in heights]
     found, tables, first, of_rooms = list[Values](), [], [], []
-    for number, (name, height) in enumerate(zip(names, heights, strict=True)):
+    for number, (name, (_, detected)) in enumerate(zip(names, charts, strict=True)):
         scans, held_out = train[of_row == number], test[of_test == number]
-        detected = RssiMap.predict(model, height=height, detected=True)
         for threshold in thresholds_dbm:
             best, *_ = of_floor = _coverages(model, detected, (scans, held_out), threshold, below)
             first += [best[0]] if threshold == thresholds_dbm[0] else []
@@ -78,13 +77,14 @@ def maps_and_coverage(
             tables.append(
                 spots.assign(**degrees, floor=name, threshold_dbm=threshold, direction=best[0].values["direction"])
             )
-    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in charts), strict=True)
+    every = [chart for chart, _ in charts]
+    lower, upper = zip(*(chart.prediction.interval(LEVEL) for chart in every), strict=True)
     maps: dict[str, NDArray[Any]] = {
-        "x": charts[0].x,
-        "y": charts[0].y,
-        "predicted": np.stack([chart.mean for chart in charts]),
+        "x": every[0].x,
+        "y": every[0].y,
+        "predicted": np.stack([chart.mean for chart in every]),
         "width": (torch.stack(upper) - torch.stack(lower)).numpy(),
-        "detection": np.stack([chart.detection for chart in charts]),
+        "detection": np.stack([chart.detection for chart in every]),
         "above": np.stack([floor.probability for floor in first]),
         "inside": np.stack([floor.inside for floor in first]),
         "known": np.stack([floor.measured for floor in first]),
@@ -99,9 +99,9 @@ def maps_and_coverage(
     maps = maps if train.origin is None else maps | {"origin": np.array(train.origin)}
     of_floors = [{"floor": name} | floor.values for name, floor in zip(names, first, strict=True)]
     of_receivers, of_bands = ([row for row in found if key in row] for key in ("receiver", "band"))
-    every = {"coverage": DataFrame(of_receivers), "weak_spots": concat(tables, ignore_index=True)}
-    every |= {"bands": DataFrame(of_bands)} if of_bands else {}
-    return maps, of_floors, every if rooms is None else every | {"rooms": DataFrame(of_rooms)}
+    of_all = {"coverage": DataFrame(of_receivers), "weak_spots": concat(tables, ignore_index=True)}
+    of_all |= {"bands": DataFrame(of_bands)} if of_bands else {}
+    return maps, of_floors, of_all if rooms is None else of_all | {"rooms": DataFrame(of_rooms)}
 
 
 def _of_rooms(rooms: Rooms, chart: RssiMap, coverage: Coverage) -> list[Values]:

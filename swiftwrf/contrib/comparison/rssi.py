@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,9 +17,10 @@ from swiftwrf.choices import RSSI_PREDICTORS, NotDetected
 from swiftwrf.contrib.comparison.base import Comparison, Recorded, Values
 from swiftwrf.contrib.comparison.coverage import maps_and_coverage
 from swiftwrf.contrib.comparison.errors import summaries, summary
-from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small, predict_each_place
-from swiftwrf.contrib.comparison.parts import fewer_rows, pool_of, region_of
-from swiftwrf.contrib.comparison.predictors import compared, make_predictor
+from swiftwrf.contrib.comparison.leave_one_out import LEAVE_ONE_OUT, distances_to_others, is_small
+from swiftwrf.contrib.comparison.parts import pool_of
+from swiftwrf.contrib.comparison.predictors import compared
+from swiftwrf.contrib.comparison.rssi_fits import RssiFits
 from swiftwrf.contrib.comparison.steps import MODEL, Memo, Steps, refusing_executor
 from swiftwrf.data import Rssi
 from swiftwrf.data.coordinates import degree_columns
@@ -32,12 +31,12 @@ from swiftwrf.errors import InputError
 from swiftwrf.metrics import LEVEL
 from swiftwrf.models.prediction import Prediction
 from swiftwrf.positions import distance, nearest
-from swiftwrf.rssi.base import RssiPredictor
+from swiftwrf.rssi.base import Map, RssiPredictor
 from swiftwrf.rssi.coverage import default_threshold, smaller_is_better
 from swiftwrf.rssi.model import RssiModel
 from swiftwrf.rssi.offsets import estimate_offsets
 from swiftwrf.rssi.pairs import PairModel
-from swiftwrf.runtime.checkpoint import Saved, load
+from swiftwrf.runtime.checkpoint import load
 from swiftwrf.runtime.validation import Fraction, PositiveInt, Preset, checked
 
 DISTANCES = ("from_receiver_m", "from_training_m")  # columns of the errors
@@ -56,7 +55,7 @@ class RssiComparison(Comparison):
             without primitives have 0 `n_primitives`.
         options: The split, the preset and the seed.
         left_out: Reason for each predictor that the data do not suffice for.
-        predictors: Fitted predictors by name. Of those whose values `keep` had, the model alone.
+        predictors: Fitted predictors by name. Of those whose values `keep` had, or a worker found, the model alone.
         by_rows: Mean absolute errors [dB] of the model and of "knn" by the number of training rows, a column for each.
         above: Thresholds of the coverage [dBm]. Defaults to that of `default_threshold`.
         below: Thresholds where smaller is better, e.g. of latency, in place of `above`.
@@ -259,6 +258,7 @@ def compare(
     device: torch.device | str = "cpu",
     keep: Memo | None = None,
     executor: Executor | None = None,
+    parallel: Map | None = None,
     progress: bool = False,
 ) -> RssiComparison:
     """Fit every predictor to the training rows of a split, and predict the test rows.
@@ -284,7 +284,8 @@ def compare(
         device: Device to compute on.
         keep: Results by the names of predictors, in a folder, and the model. A call with equal data, options, code and
             versions continues after them, others are refused.
-        executor: Processes that fit receivers side by side, e.g. a `ProcessPoolExecutor`.
+        executor: Processes that compute steps side by side, e.g. a `ProcessPoolExecutor`.
+        parallel: Function that maps the fit of the model over receivers, e.g. on other machines; see `RssiModel.fit`.
         progress: Show a progress bar on a terminal.
 
     Raises:
@@ -312,7 +313,6 @@ def compare(
     if pool.groups is not None:
         offsets = estimate_offsets(pool, reference)
         train, pool = offsets.removed(train), offsets.removed(pool)
-    offset = 0.0 if train.offsets is None else train.offsets.of(test)[:, None]
     kind = train.validation_for(split, test) if validation == "auto" else validation
     options: Values = {"validation": kind, "seed": seed, "new_places": split == PLACE, "not_detected": not_detected}
     if kind == "random" != split:  # test rows of a split that comes with the data may be of another day or device
@@ -327,84 +327,42 @@ def compare(
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
     begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), below=tuple(below), rooms=rooms)
-    model_name, predictors = begun.model, dict[str, RssiPredictor]()
-    parallel = None if executor is None else executor.map
+    fits = RssiFits(train, pool, test, own, preset, options, small, begun.model, device)
 
-    def compute(_: None, folder: Path, name: str, rows: Tensor | None = None) -> Values:
-        def fit(rows: Rssi, pool: Rssi) -> RssiPredictor:
-            predictor = deepcopy(own[name]) if name in own else make_predictor(name, preset, **options)
-            return predictor.fit(rows, pool=pool, device=device, parallel=parallel, progress=progress)
-
-        part, every = (train, pool) if rows is None else (train.subset(rows), pool.subset(rows))
-        began = time.perf_counter()
-        predictor = fit(part, every)
-        fitted = time.perf_counter()
-        if small:
-            prediction, probability = predict_each_place(fit, train, pool)
-        else:
-            prediction, probability = predictor.predict_detected(test), None
-        seconds = {"fit": fitted - began, "predict": time.perf_counter() - fitted}
-        # fractions of detected and of empty test cells that are predicted as such, if there are both kinds
-        detection = None
-        if rows is None:
-            predictors[name], detected = predictor, test.detected
-            if name == model_name and isinstance(predictor, Saved):
-                predictor.save(folder / MODEL)
-            if predictor.detection is not None and not bool(detected.all()) and not test.receiver_moves:
-                if probability is None:
-                    probability = predictor.predict_detection(test.transmitter_position, offset)
-                above = probability > 0.5
-                detection = float(above[detected].double().mean()), float((~above)[~detected].double().mean())
-        std = None if prediction.std is None else prediction.std[test.detected]
-        error = (prediction.mean + offset - test.rssi_dbm)[test.detected].abs()
-        return {
-            "seconds": seconds,
-            "predicted": prediction.mean[test.detected],
-            "std": std,
-            "mean": float(error.mean()),
-            "median": float(error.quantile(0.5)),
-            "held_out": getattr(predictor, "held_out_db", {}),
-            "detection": detection,
-            "n_primitives": getattr(predictor, "n_primitives", 0),
-        }
-
-    studied = [name for name in (model_name, "knn") if name in names]
-    region = region_of(train, seed) if split == "random" else None
-
-    def study(_: None, folder: Path) -> Values:
-        parts = fewer_rows(train, fewer, seed)
-        less = {str(len(rows)): {name: compute(_, folder, name, rows)["mean"] for name in studied} for rows in parts}
-        less |= {str(len(train)): {name: values[name]["mean"] for name in studied}}
-        return {"rows": less, "region": {} if region is None else {name: error_in(name, *region) for name in studied}}
-
-    def error_in(name: str, out: Tensor, others: Tensor) -> float:
-        predictor, asked = make_predictor(name, preset, **options | {"validation": "block"}), train.subset(out)
-        predictor.fit(train.subset(others), pool=pool.subset(others), device=device, parallel=parallel)
-        return float((predictor.predict_detected(asked).mean - asked.rssi_dbm)[asked.detected].abs().mean())
-
-    def repeat(_: None, folder: Path, number: int) -> Values:
+    def repeat(_: RssiFits, folder: Path, number: int) -> Values:
         once: Values = {"seed": seed + number, "repeats": 1, "fewer": (), "keep": None, "progress": False}
         again = compare(**given | once)
         return {name: {"median": found["median"], "mean": found["mean"]} for name, found in again.values.items()}
 
     memo = keep or Memo()
+    # fits that are computed here: those whose receivers go to other machines, and predictors that may not reach a worker
+    here, there = Steps(replace(fits, parallel=parallel, progress=progress), memo), Steps(fits, memo, executor)
+    long = there if parallel is None else here
+    of = {name: here if name in own else long if name == begun.model else there for name in names}
     with refusing_executor(executor):
-        steps = Steps(None, memo)
-        started = [steps.start(name, f"fitting and testing {name}", compute, name) for name in names]
+        for name, steps in of.items():
+            is_long = name in (begun.model, "gp")
+            steps.start(name, f"fitting and testing {name}", RssiFits.tested, name, first=is_long)
+        studied = [name for name in (begun.model, "knn") if name in names]
         if fewer:
-            steps.start("fewer rows", "fitting fewer rows", study)
+            long.start("fewer rows", "fitting fewer rows", RssiFits.studied, studied, fewer, split, first=True)
         others = [
-            steps.start(f"split {number + 1}", f"fitting and testing split {number + 1}", repeat, number)
+            here.start(f"split {number + 1}", f"fitting and testing split {number + 1}", repeat, number)
             for number in range(1, repeats)
         ]
-        values = {name: steps[name] for name in started}
-        studies = steps["fewer rows"] if fewer else {"rows": {}, "region": {}}
-        by_rows = DataFrame.from_dict(studies["rows"], orient="index")
-        splits = [values, *(steps[name] for name in others)] if others else []
-        if model_name in names and model_name not in predictors:
-            model = load(memo.folder / MODEL)
-            assert isinstance(model, RssiModel | PairModel)
-            predictors[model_name] = model
+        if long is here:
+            there.submit()
+        values = {name: steps[name] for name, steps in of.items()}
+        studies = long["fewer rows"] if fewer else {"rows": {}, "region": {}}
+        splits = [values, *(here[name] for name in others)] if others else []
+    predictors = dict(fits.predictors)
+    if begun.model in names and begun.model not in predictors:
+        model = load(memo.folder / MODEL)
+        assert isinstance(model, RssiModel | PairModel)
+        predictors[begun.model] = model
+    by_rows = DataFrame.from_dict(studies["rows"], orient="index")
+    if fewer:
+        by_rows.loc[str(len(train))] = {name: values[name]["mean"] for name in studied}
     by_rows = by_rows.set_index(by_rows.index.astype(int)).rename_axis("n_train")
     errors = [
         {"method": name, "seed": seed + number, "median": found[name]["median"], "mean": found[name]["mean"]}

@@ -1,19 +1,17 @@
-"""Baselines for RSSI: the mean, path-loss models, neighbours and Gaussian processes."""
+"""Baselines for RSSI: the mean, path-loss models, neighbours and Gaussian processes.
+
+Scikit-learn takes a second to load, which a command whose processes fit them does not need.
+"""
 
 from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.dummy import DummyRegressor
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, Kernel, Matern, WhiteKernel
-from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
 from torch import Tensor, from_numpy
 
 from swiftwrf.data import Rssi
@@ -23,6 +21,11 @@ from swiftwrf.rssi.detection import Detection
 from swiftwrf.rssi.pairs import PairPredictor
 from swiftwrf.rssi.path_loss import PathLoss, fit_path_loss, fit_path_losses, log_distance
 from swiftwrf.runtime.threads import parallel_map
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import Kernel
+    from sklearn.neighbors import KNeighborsRegressor
 
 MAX_TREE_COLUMNS = 15  # of coordinates whose neighbours a tree finds
 NEIGHBOUR_COUNTS = (1, 3, 5, 8, 12, 20, 40, 80, 120)
@@ -98,6 +101,9 @@ class ReceiverRegressors(RssiPredictor):
         """Return a regressor fitted to positions (n, 3) and values (n,) of one receiver."""
 
     def _fit(self, train: Rssi, **_: Any) -> None:
+        from sklearn.dummy import DummyRegressor
+        from sklearn.exceptions import ConvergenceWarning
+
         residual, base = train.rssi_dbm, self._base(train)
         self._simpler = base and base.fit(train)
         if self._simpler is not None:
@@ -165,6 +171,8 @@ class GPPredictor(ReceiverRegressors):
         return ReceiverPathLoss() if train.located else Mean()
 
     def _regressor(self, x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> Any:
+        from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
         scale = max(float(np.var(y)), 1e-6)
         extent = float(np.ptp(x, axis=0).max()) or 1.0
         length = Matern(extent / 10, (extent / 200, 2.5 * extent), nu=1.5)
@@ -181,6 +189,8 @@ def fit_process(
     The parameters of the kernel maximise the marginal likelihood of 500 random rows, from its values and within its bounds.
     The process is conditioned on 1500 rows. With `normalize`, values are scaled to mean 0 and variance 1.
     """
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
     order = np.random.default_rng(seed).permutation(len(y))
     tuned, kept = order[:MAX_TUNING_ROWS], order[:MAX_GP_ROWS]
     tuning = GaussianProcessRegressor(kernel, normalize_y=normalize, random_state=seed).fit(x[tuned], y[tuned])
@@ -189,6 +199,8 @@ def fit_process(
 
 def choose_neighbours(x: NDArray[Any], y: NDArray[Any], fold: NDArray[Any]) -> KNeighborsRegressor:
     """Return a regressor fitted to coordinates (n, d) and values (n, ...), settings by held-out folds (n,)."""
+    from sklearn.neighbors import KNeighborsRegressor, NearestNeighbors
+
     # scikit-learn's choice for many neighbours computes distances from squares and a product, which cancel map coordinates
     algorithm = "kd_tree" if x.shape[1] <= MAX_TREE_COLUMNS else "auto"
     numbers, values = np.unique(fold), y.reshape(len(y), -1)

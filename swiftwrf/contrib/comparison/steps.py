@@ -194,18 +194,32 @@ class Steps(Generic[Context]):
             self._advance()
         return self._values[name]
 
+    def submit(self) -> None:
+        """Send all steps to the workers, if there are any."""
+        if self._executor is not None:
+            self._send(self._executor, len(self._waiting))
+
+    def _send(self, executor: Executor, number: int) -> None:
+        """Send at most this number of steps to the workers."""
+        for _ in range(min(number, len(self._waiting))):
+            name, call = self._begun()
+            with refusing_executor(executor):
+                self._pending[executor.submit(self._compute, *call)] = name
+
+    def _begun(self) -> tuple[str, tuple[Any, ...]]:
+        """Return the name and the call of the step that comes next, which begins now."""
+        name = min(self._waiting, key=lambda name: not self._waiting[name][0])
+        _, title, call = self._waiting.pop(name)
+        self.memo.begin(name, title)
+        return name, call
+
     def _advance(self) -> None:
         """Compute a step here, or keep the results of workers that are done."""
-        slots = self._slots()  # raises an error if all workers are lost
-        while self._waiting and len(self._pending) < slots:
-            name = min(self._waiting, key=lambda name: not self._waiting[name][0])
-            _, title, call = self._waiting.pop(name)
-            self.memo.begin(name, title)
-            if self._executor is None:
-                self._values[name] = self.memo.keep(name, *self._compute(*call))
-                return
-            with refusing_executor(self._executor):
-                self._pending[self._executor.submit(self._compute, *call)] = name
+        if self._executor is None:
+            name, call = self._begun()
+            self._values[name] = self.memo.keep(name, *self._compute(*call))
+            return
+        self._send(self._executor, self._slots() - len(self._pending))  # raises an error if all workers are lost
         for future in wait(self._pending, POLL_S, FIRST_COMPLETED).done:
             name = self._pending.pop(future)
             with refusing_executor(self._executor):

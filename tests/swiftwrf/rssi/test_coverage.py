@@ -208,6 +208,18 @@ def test_nothing_is_measured_without_scans():
     assert found.values["scans_above"] is None
 
 
+def test_detected_packets_between_moving_ends_have_the_map_of_all():
+    """Cells are no measured pairs, but their prediction is that of a packet."""
+    model = PairModel().fit(rssi_room(n=30))
+    every, detected = RssiMap.of_packets(model, 4.0)
+    at = np.stack([*np.meshgrid(every.x, every.y), np.full(every.mean.shape[1:], every.height)], axis=-1)
+    assert np.allclose(detected.mean.reshape(12, -1).T, model.predict(at.reshape(-1, 3)).mean, atol=1e-4)
+    assert np.array_equal(every.std, detected.std)
+    one, rows = detected.receivers(["receiver01"]), rssi_room(n=30).receivers(["receiver01"])
+    chance = norm.cdf((one.mean[0] + 75) / one.std[0])
+    assert np.allclose(Coverage.of(one, rows, (-75.0, 0.9, 1)).probability, chance, atol=1e-4)
+
+
 def test_a_row_at_a_receiver_that_moves_is_no_scan():
     data = rssi_room(n=30)
     chart = RssiMap.predict(PairModel().fit(data), 4.0, detected=True)

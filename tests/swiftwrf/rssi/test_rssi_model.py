@@ -1,12 +1,14 @@
 """The RSSI model: its regression against slow definitions, its intervals, its files, and awkward data."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scipy.optimize import minimize
@@ -33,6 +35,26 @@ CPU, FIRST = torch.device("cpu"), 0
 
 
 @only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
+def test_steps_and_receivers_of_workers_are_those_computed_here():
+    """Receivers of the model go through `parallel` alone, those of other predictors do not."""
+    data, asked = rssi_room(n=80).columns([1, 5]), []
+
+    def parallel(function, items):
+        asked.append(list(items))
+        return map(function, asked[-1])
+
+    here = compare(data, fewer=(0.5,))
+    with ThreadPoolExecutor(1) as executor:
+        found = [compare(data, fewer=(0.5,), executor=executor)]
+        found.append(compare(data, fewer=(0.5,), executor=executor, parallel=parallel))
+    for there in found:
+        pd.testing.assert_frame_equal(there.summary()[["median", "mean"]], here.summary()[["median", "mean"]])
+        pd.testing.assert_frame_equal(there.by_rows, here.by_rows)
+        assert there.region == here.region
+    assert asked == 6 * [[0, 1]]  # all rows, half of them, and those outside of the region, each by two kernels
+
+
+@only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
 def test_errors_by_the_number_of_training_rows(tmp_path):
     room = rssi_room(n=200, seed=1)
     asked = []
@@ -44,7 +66,7 @@ def test_errors_by_the_number_of_training_rows(tmp_path):
     errors = whole.summary()["mean"]
     assert found.loc[160].to_dict() == pytest.approx(errors[["swiftwrf", "knn"]].to_dict())
     assert whole.by_rows.empty
-    assert asked == ["swiftwrf", "mean", "knn", "fewer rows"]  # as many steps as a run announces
+    assert asked == ["swiftwrf", "fewer rows", "mean", "knn"]  # as many steps as a run announces
 
 
 @only(RSSI_PREDICTORS, "swiftwrf", "mean", "knn")
