@@ -85,16 +85,16 @@ def functions(stats: pstats.Stats) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: -row["below"])
 
 
-def write_channels(folder: Path) -> None:
+def write_channels(folder: Path, n_positions: int = N_POSITIONS, n_subcarriers: int = N_SUBCARRIERS) -> None:
     """Write channels of one array in the simulated office as snapshots.npz."""
     folder.mkdir()
     generator = torch.Generator().manual_seed(0)
     low, high = torch.tensor(OFFICE_REGION, dtype=torch.float64)
-    position = low + (high - low) * torch.rand(N_POSITIONS, 3, dtype=torch.float64, generator=generator)
+    position = low + (high - low) * torch.rand(n_positions, 3, dtype=torch.float64, generator=generator)
     pose, array = STATIONS["west"], PlanarArray.square(4, OFFICE.frequency_hz)
     paths = OFFICE.paths(position, torch.tensor(pose.position, dtype=torch.float64))
     paths = replace(paths, direction=paths.direction @ pose.rotation)
-    channel, frequency = paths.subcarriers(array, N_SUBCARRIERS, BANDWIDTH_HZ)
+    channel, frequency = paths.subcarriers(array, n_subcarriers, BANDWIDTH_HZ)
     std = channel.abs().square().mean().sqrt() * 10 ** (-SNR_DB / 20)
     channel = channel + std * torch.randn(channel.shape, dtype=channel.dtype, generator=generator)
     np.savez(

@@ -1,9 +1,9 @@
-"""Seconds and memory of surveys of many receivers and rows, beside those of another checkout of the project.
+"""Seconds and memory of commands and of surveys of many receivers and rows, beside those of another checkout.
 
 python benchmarks/survey_speed.py first receivers scans --against DIR
 
-Each case runs in a process of one thread, first with the code of this commit, then with that of `--against`. `seconds` are
-those of a clock, `processor` those of a processor, which other work on the machine changes less. `workers` is
+Each case runs with the threads and processes that it has by default, first with the code of this commit, then with that of
+`--against`. Nothing else should run on the machine. `peak_gib` is the memory of the largest process. `workers` is
 `swiftwrf rssi` on 600 scans of 60 receivers, on a Dask cluster of this machine with 1, 2 and 4 workers.
 """
 
@@ -21,9 +21,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from profiles import write_channels
 from record import ROOT, kept, options, write_result
 
-Case = Literal["first", "one", "aoa", "packets", "map", "receivers", "scans", "locate", "workers"]
+Case = Literal[
+    "first", "one", "aoa", "packets", "map", "receivers", "scans", "channels", "locate", "circular", "workers"
+]
 GIB = 2**20  # in kibibytes
 N_WORKERS = (1, 2, 4)
 LOCATE = """
@@ -31,11 +34,19 @@ import json, sys, time, numpy as np, swiftwrf
 data = swiftwrf.load_rssi(sys.argv[1])
 train, scans = data[:1000], data[1000:].rssi_dbm
 locator = swiftwrf.RssiLocator().fit(train)
-began = time.perf_counter(), time.process_time()
+began = time.perf_counter()
 for rows in scans.split(125):
     found = locator.locate(rows)
     found.median, [found.credible_radius(level) for level in (0.5, 0.8, 0.95)], found.ambiguous
-print(json.dumps({"seconds": time.perf_counter() - began[0], "processor": time.process_time() - began[1]}))
+print(json.dumps({"seconds": time.perf_counter() - began}))
+"""
+CHANNELS = """
+import json, sys, time, swiftwrf
+data = swiftwrf.load_spectra(sys.argv[1])
+locator = swiftwrf.MatchedField().fit(data[:100])
+began = time.perf_counter()
+locator.locate(data[100:]).median
+print(json.dumps({"seconds": time.perf_counter() - began}))
 """
 MAP = "import sys, swiftwrf; print(swiftwrf.fit_rssi(swiftwrf.load_rssi(sys.argv[1])))"
 READ = "import sys, swiftwrf; print(len(swiftwrf.load_rssi(sys.argv[1])))"
@@ -45,12 +56,13 @@ READ = "import sys, swiftwrf; print(len(swiftwrf.load_rssi(sys.argv[1])))"
 class Config:
     cases: Annotated[tuple[Case, ...], tyro.conf.Positional]
     """first: README's first command; one: rssi --rx 6; aoa: aoa --mix 0.3; packets: reading rows of a long table; map:
-    fit_rssi on 2,000 rows of 100 receivers; receivers: rssi on them; scans: 1,000 scans located among 500 receivers; locate:
-    swiftwrf locate on a survey with a published split; workers: rssi on a cluster. Earlier results are kept"""
+    fit_rssi on 2,000 rows of 100 receivers; receivers: rssi on them; scans: 1,000 scans located among 500 receivers;
+    channels: 200 channels of 8 subcarriers located in the office; locate: swiftwrf locate on a survey with a published
+    split; circular: aoa --mix 0.7 on channels of a circular array; workers: rssi on a cluster. Earlier results are kept"""
     against: Path | None = None
     """another checkout"""
     data: Path | None = None
-    """survey of `locate`"""
+    """survey of `locate`, or channels of `circular`"""
     n_packets: int = 5_000_000
     """rows of `packets`"""
 
@@ -58,7 +70,7 @@ class Config:
 def main(config: Config) -> None:
     """Measure each case and write `results/survey_speed.json`."""
     for case in config.cases:
-        name = f"locate {config.data.name}" if case == "locate" and config.data else case
+        name = f"{case} {config.data.name}" if case in ("locate", "circular") and config.data else case
         with TemporaryDirectory() as folder:
             found = workers(Path(folder)) if case == "workers" else measured(case, Path(folder), config)
         print(name, json.dumps(found), flush=True)
@@ -67,7 +79,7 @@ def main(config: Config) -> None:
 
 
 def measured(case: Case, folder: Path, config: Config) -> dict[str, Any]:
-    """Return seconds, processor seconds and peak memory of a case in this checkout, and in the other one."""
+    """Return seconds and peak memory of a case in this checkout, and in the other one."""
     arguments = command(case, folder, config)
     found = {"here": run(arguments, folder, ROOT)}
     return found if config.against is None else found | {"against": run(arguments, folder, config.against)}
@@ -81,7 +93,13 @@ def command(case: Case, folder: Path, config: Config) -> list[str]:
         case "one":
             return ["-m", "tasks", "rssi", "--rx", "6"]
         case "aoa":
-            return ["-m", "tasks", "aoa", "--mix", "0.3", "--processes", "1"]
+            return ["-m", "tasks", "aoa", "--mix", "0.3"]
+        case "channels":
+            write_channels(folder / "channels", 300, 8)
+            return ["-c", CHANNELS, str(folder / "channels")]
+        case "circular":
+            (folder / "reading.yaml").write_text("grid: [16, 72]\n")
+            return ["-m", "tasks", "aoa", "--mix", "0.7", "--data", str(config.data), "--read", "reading.yaml"]
         case "packets":
             return ["-c", READ, str(write_packets(folder / "survey.csv", config.n_packets))]
         case "map":
@@ -96,7 +114,7 @@ def command(case: Case, folder: Path, config: Config) -> list[str]:
 
 def run(arguments: list[str], folder: Path, checkout: Path) -> dict[str, float]:
     """Run Python with the code of a checkout; what it prints as JSON replaces seconds of the whole process."""
-    environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
     output = folder / "output.txt"
     with output.open("w") as stream:
         began = time.perf_counter()
@@ -105,7 +123,7 @@ def run(arguments: list[str], folder: Path, checkout: Path) -> dict[str, float]:
         seconds = time.perf_counter() - began
     if status:
         raise SystemExit(f"{arguments} in {checkout} ended with {os.waitstatus_to_exitcode(status)}")
-    found = {"seconds": seconds, "processor": usage.ru_utime + usage.ru_stime, "peak_gib": usage.ru_maxrss / GIB}
+    found = {"seconds": seconds, "peak_gib": usage.ru_maxrss / GIB}
     last = output.read_text().splitlines()[-1]
     return found | (json.loads(last) if last.startswith("{") else {})
 

@@ -42,10 +42,11 @@ COMMANDS = {
 }
 # modules that processes of a run load while the run itself begins
 DRAWING = ("tasks.page.figures",)
+BASELINES = ("sklearn.linear_model", "sklearn.gaussian_process", "sklearn.neighbors")
 PRELOADED = {
     "aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo", *DRAWING),
-    "rssi": ("swiftwrf.contrib.comparison.rssi", *DRAWING),
-    "locate": ("swiftwrf.contrib.comparison.locating", *DRAWING),
+    "rssi": ("swiftwrf.contrib.comparison.rssi_baselines", *BASELINES, *DRAWING),
+    "locate": ("swiftwrf.contrib.comparison.locating", *BASELINES, *DRAWING),
     "plan": DRAWING,
     "report": DRAWING,
     "update": DRAWING,
