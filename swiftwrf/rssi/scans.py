@@ -57,12 +57,19 @@ def at_least(
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)  # of the factor that the errors share
     for node, weight in zip(nodes, weights / weights.sum(), strict=True):
         given = torch.special.ndtr((score + math.sqrt(correlation) * node) / math.sqrt(1 - correlation))
-        counts = [torch.ones_like(total), *(torch.zeros_like(total) for _ in range(number - 1))]
-        for above in given:  # probabilities of 0 to number - 1 receivers
-            fewer = [torch.zeros_like(above), *counts[:-1]]
-            counts = [count * (1 - above) + less * above for count, less in zip(counts, fewer, strict=True)]
-        total += weight * (1 - torch.stack(counts).sum(dim=0))
+        total += weight * (1 - _fewer_than(number, given))
     return total
+
+
+def _fewer_than(number: int, above: Tensor) -> Tensor:
+    """Return the probability (...) that fewer than a number of R independent events occur, of probabilities (R, ...)."""
+    if number == 1:  # without a loop over receivers, of which there may be hundreds
+        return (1 - above).prod(dim=0)
+    counts = [torch.ones_like(above[0]), *(torch.zeros_like(above[0]) for _ in range(number - 1))]
+    for each in above:  # probabilities of 0 to number - 1 events
+        fewer = [torch.zeros_like(each), *counts[:-1]]
+        counts = [count * (1 - each) + less * each for count, less in zip(counts, fewer, strict=True)]
+    return torch.stack(counts).sum(dim=0)
 
 
 def choose_correlation(

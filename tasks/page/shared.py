@@ -311,7 +311,7 @@ def recommendation(run: Records, model: str, unit: str) -> tuple[str, list[str]]
         return model, []
     return chosen, [
         f"Recommended is {chosen} and not {model}: its mean error at held-out training rows is {held_out[chosen]:.2f} "
-        f"{unit}, that of {model} {held_out[model]:.2f} {unit}. These rows do not show how RSSI depends on the place."
+        f"{unit}, that of {model} {held_out[model]:.2f} {unit}. These rows do not show how measurements depend on the place."
     ]
 
 

@@ -85,8 +85,9 @@ def _summary(run: Records, found: Answer) -> Summary:
     error = {name: entry["abs_error_db"] for name, entry in run.metrics["overall"].items()}
     best = best_baseline(run)
     unit = floors[0].error_unit
+    covered = [(maps, maps.coverage["covered"]) for maps in floors]
     numbers = [
-        *(Number(f"{maps.coverage['covered'] or 0:.0%}", f"of {maps.place} {maps.limit}") for maps in floors),
+        *(Number(f"{share:.0%}", f"of {maps.place} {maps.limit}") for maps, share in covered if share is not None),
         Number(f"{error[found.chosen]['median']:.2f} {unit}", f"median absolute error of {found.chosen}"),
         Number(f"{error[best]['median']:.2f} {unit}", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),

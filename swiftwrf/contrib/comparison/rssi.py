@@ -327,7 +327,8 @@ def compare(
         keep.of(given | {"predictors": [RSSI_PREDICTORS[name] for name in names]})
     shown = {"split": LEAVE_ONE_OUT if small else split, "preset": preset, "seed": seed}
     begun = RssiComparison(train, test, {}, shown, left_out, above=tuple(above), below=tuple(below), rooms=rooms)
-    fits = RssiFits(train, pool, test, own, preset, options, small, begun.model, device)
+    in_process = progress and executor is None
+    fits = RssiFits(train, pool, test, own, preset, options, small, begun.model, device, progress=in_process)
 
     def repeat(_: RssiFits, folder: Path, number: int) -> Values:
         once: Values = {"seed": seed + number, "repeats": 1, "fewer": (), "keep": None, "progress": False}
@@ -336,7 +337,8 @@ def compare(
 
     memo = keep or Memo()
     # fits that are computed here: those whose receivers go to other machines, and predictors that may not reach a worker
-    here, there = Steps(replace(fits, parallel=parallel, progress=progress), memo), Steps(fits, memo, executor)
+    here = Steps(replace(fits, parallel=parallel, progress=progress), memo)
+    there = Steps(fits, memo, executor, writes=parallel is None)  # the model alone writes a file
     long = there if parallel is None else here
     of = {name: here if name in own else long if name == begun.model else there for name in names}
     with refusing_executor(executor):

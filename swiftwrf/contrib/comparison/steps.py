@@ -143,7 +143,8 @@ class Steps(Generic[Context]):
     Args:
         context: First argument of each function, which is sent to each worker once.
         memo: Kept results. They are not computed again.
-        executor: Workers that see the memo's folder. By default each step is computed here, in order.
+        executor: Workers. By default each step is computed here, in order.
+        writes: Whether steps write files or read those of others, so that workers must see the memo's folder.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -156,9 +157,9 @@ class Steps(Generic[Context]):
         [11, 12]
     """
 
-    def __init__(self, context: Context, memo: Memo, executor: Executor | None = None) -> None:
+    def __init__(self, context: Context, memo: Memo, executor: Executor | None = None, *, writes: bool = True) -> None:
         self.memo = memo
-        self._compute = partial(_compute, context, memo.folder.resolve())
+        self._compute = partial(_compute, context, memo.folder.resolve(), writes)
         self._executor = executor
         # number of steps that workers take together; steps beyond wait, because one that others wait for may come
         self._slots: Callable[[], int] = getattr(executor, "slots", lambda: sys.maxsize)
@@ -226,9 +227,11 @@ class Steps(Generic[Context]):
                 self._values[name] = self.memo.keep(name, *future.result())
 
 
-def _compute(context: Context, folder: Path, function: Callable[..., Row], *arguments: Any) -> tuple[Row, float]:
+def _compute(
+    context: Context, folder: Path, writes: bool, function: Callable[..., Row], *arguments: Any
+) -> tuple[Row, float]:
     """Return values and seconds of a step, computed here or in a worker."""
-    if not (folder / STEPS).is_dir():
+    if writes and not (folder / STEPS).is_dir():
         raise InputError(f"a worker does not see {folder}; choose an --out on a file system that all machines share")
     began = time.perf_counter()
     return function(context, folder, *arguments), time.perf_counter() - began

@@ -17,6 +17,8 @@ from scipy.stats import norm
 
 from swiftwrf import load, load_rssi, rssi_room
 from swiftwrf.rssi.coverage import reach
+from tasks.records import Records
+from tasks.rssi.page import page
 from tasks.view.rssi import MapSelection
 from tasks.view.sources import open_source
 
@@ -197,3 +199,13 @@ def test_widths_are_those_of_the_80_percent_interval(building):
         std = model.predict(np.c_[cells, np.full(len(cells), height)]).std.numpy()
         width = np.subtract(*norm.interval(0.8, scale=std)[::-1])
         np.testing.assert_allclose(maps["width"][floor], width.T.reshape(maps["width"].shape[1:]), rtol=1e-4)
+
+
+def test_no_share_is_stated_of_a_floor_without_measured_cells(building):
+    folder, _ = building
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["coverage"][1] |= {"covered": None, "uncertain": None, "not_covered": None}
+    found = page([Records(folder, metrics)])
+    assert "No cell of the map is in the measured area of floor 1." in found.summary.conclusion
+    stated = [number.meaning for number in found.summary.numbers if number.value.endswith("%")]
+    assert [meaning.partition(" above")[0] for meaning in stated[:-1]] == ["of the measured area of Ground floor"]
