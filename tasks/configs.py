@@ -453,7 +453,7 @@ class UpdateConfig(ReadingConfig):
     """
 
     model: Annotated[str, tyro.conf.Positional]
-    """file of a fitted model of spectra or RSSI"""
+    """file of a fitted model of spectra or RSSI, or directory of a run of rssi"""
     source: Annotated[str, tyro.conf.Positional]
     """measurements of any known format in the order in which they were taken; with --follow a .ndjson or .csv file
     that grows, or - for standard input"""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from os.path import isfile  # unlike Path.is_file, it is False for names that are too long
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +26,11 @@ from swiftwrf.runtime.checkpoint import Saved
 from swiftwrf.runtime.durable import replacing, write_json
 from tasks.command import run_module
 from tasks.configs import FILES, MAP_FILES, ConvertConfig
-from tasks.directory import check_new_file, kept_model, new_directory
+from tasks.directory import check_new_file, model_file, new_directory
 from tasks.environment import command, invocation
 from tasks.options import by_name
 from tasks.page import figures
-from tasks.records import CONFIG, rounded, write_table
+from tasks.records import rounded, write_table
 from tasks.source import reading
 from tasks.terminal import console, terminal
 
@@ -139,10 +138,7 @@ def saved_model(source: Path) -> RssiModel | None:
     Raises:
         InputError: A run without an RSSI model, or a model of which no map is written.
     """
-    kept = kept_model(source)
-    if kept is None and isfile(source / CONFIG):
-        raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
-    file = kept or source
+    file = model_file(source)
     if file.suffix != ".safetensors":
         return None
     model: Saved = load(file)

@@ -39,6 +39,18 @@ def kept_model(folder: Path) -> Path | None:
     return next((file for name in (MODEL, LOCATOR) if isfile(file := folder / name)), None)
 
 
+def model_file(source: Path) -> Path:
+    """Return the file of a model: the given one, or the one that a run of RSSI or of locating keeps.
+
+    Raises:
+        InputError: The directory of another run.
+    """
+    kept = kept_model(source)
+    if kept is None and isfile(source / CONFIG):
+        raise InputError(f"{source} is a run without an RSSI model; name one of its models, {source}/....safetensors")
+    return kept or source
+
+
 def begun(folder: Path) -> bool:
     """Return True if a run in this directory has written its configuration or computed a step."""
     names = {file.name for file in folder.iterdir() if not file.name.startswith(".")}

@@ -115,7 +115,7 @@ class Coverage:
             most 1 - `certainty`) and `uncertain`, of the cells inside that are `not_measured`, and of the `n_scans` scans
             that are above, `scans_above`; with `threshold_dbm`, `direction` ("above" or "below", which then holds for
             `scans_above`, too), `certainty`, `at_least` (number of receivers) and `reach_m`. None is a fraction of
-            nothing, and no limit.
+            nothing, and no limit. All are None between ends that both move.
     """
 
     probability: NDArray[np.float64]
@@ -157,11 +157,12 @@ class Coverage:
         above = passing(scans.rssi_dbm, threshold_dbm, number, below).numpy()
         of_cell = classified(probability, measured, certainty)[measured]
         parts = {name.replace(" ", "_"): of_cell == CLASSES.index(name) for name in CLASSES[:0:-1]}
-        # a row at a receiver that moves is no scan
-        parts |= {"not_measured": ~measured[enclosed], "scans_above": above[: 0 if scans.receiver_moves else None]}
+        parts |= {"not_measured": ~measured[enclosed], "scans_above": above}
+        if scans.receiver_moves:  # a row is no scan, and the places where a receiver was are not there at once
+            parts = {name: part[:0] for name, part in parts.items()}
         fractions = {name: float(part.mean()) if len(part) else None for name, part in parts.items()}
-        limited = {"threshold_dbm": threshold_dbm, "direction": "below" if below else "above"}
-        limited |= {"certainty": certainty, "at_least": number, "n_scans": len(above)}
+        limited: dict[str, Any] = {"threshold_dbm": threshold_dbm, "direction": "below" if below else "above"}
+        limited |= {"certainty": certainty, "at_least": number, "n_scans": None if scans.receiver_moves else len(above)}
         reach_m = reach if math.isfinite(reach) else None
         return cls(probability, enclosed, measured, {**limited, "reach_m": reach_m, **fractions})
 
@@ -185,7 +186,7 @@ class Coverage:
             ['x_m', 'y_m', 'area_m2', 'not_covered_m2']
         """
         threshold_dbm, certainty, number = (self.values[name] for name in ("threshold_dbm", "certainty", "at_least"))
-        of_cell = classified(self.probability, self.measured, certainty)
+        of_cell = classified(self.probability, self.measured & (self.values["n_scans"] is not None), certainty)
         sign = -1 if self.values["direction"] == "below" else 1
         shortfall = sign * (threshold_dbm - chart.mean) + ndtri(certainty) * chart.std.astype(float)
         order = np.argsort(shortfall, axis=0, kind="stable")[number - 1]

@@ -17,7 +17,12 @@ MIN_MISSING_DB = 0.5  # below which lost packets are what is missing
 
 
 def coverage_sentence(found: Row, passing: str, where: str = "the measured area") -> str:
-    """Return a coverage in words, by `Coverage.values`, receivers and threshold, and the name of the measured area."""
+    """Return a coverage in words, by `Coverage.values`, receivers and threshold, and the name of the measured area.
+
+    It is empty where both ends move.
+    """
+    if found["n_scans"] is None:
+        return ""
     if found["covered"] is None:
         return f"No cell of the map is in {where}."
     shares = {name: f"{share:.0%}" for name, share in found.items() if isinstance(share, float)}
@@ -35,8 +40,8 @@ def coverage_sentence(found: Row, passing: str, where: str = "the measured area"
 
 
 def why(run: Records) -> str:
-    """Return the default threshold of the coverage, and why it is that one; empty if it was asked for."""
-    if run.metrics["threshold"] is None:
+    """Return the default threshold of the coverage, and why it is that one; empty if it was asked for or does not count."""
+    if run.metrics["threshold"] is None or run.metrics["coverage"][0]["n_scans"] is None:
         return ""
     threshold, unit = run.metrics["coverage"][0]["threshold_dbm"], Maps(run).unit
     options = "--above" if unit == "dBm" else "--above or --below"
@@ -97,9 +102,11 @@ def missing(spot: Row, maps: Maps) -> str:
     return f"{maps.amount(spot['missing_db'])} {'too high' if maps.is_below else 'missing'}"
 
 
-def section(run: Records) -> Section:
-    """Return weak spots, and coverage by threshold and receiver."""
-    floors = Maps.of_floors(run)
+def section(run: Records) -> Section | None:
+    """Return weak spots, and coverage by threshold and receiver. None where both ends move."""
+    floors = [maps for maps in Maps.of_floors(run) if maps.has_coverage]
+    if not floors:
+        return None
     tables = [_spots(floors)] if any(maps.spots for maps in floors) else []
     every, several, limit = run.table("coverage"), len(floors) > 1, f"{floors[0].direction} [{floors[0].unit}]"
     of_one = ~every["receiver"].isin([ANY, TWO])

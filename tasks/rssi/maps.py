@@ -82,6 +82,11 @@ class Maps:
         return found
 
     @property
+    def has_coverage(self) -> bool:
+        """Whether receivers stay where they are, so that a scan may have one of them."""
+        return self.coverage["n_scans"] is not None
+
+    @property
     def suffix(self) -> str:
         """End of the names of files of this floor, if there are several."""
         return "" if len(self.arrays["floor_names"]) == 1 else f"-{self.floor}"

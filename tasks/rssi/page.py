@@ -56,8 +56,10 @@ LIMITS = (
 def page(runs: list[Records]) -> Page:
     """Return the page of these runs."""
     answers = {run: answer(run) for run in runs}
+    covered = sections_of("Coverage", runs, coverage.section)
+    first_sections = [covered] if covered.tables or covered.parts else []
     sections = [
-        sections_of("Coverage", runs, coverage.section),
+        *first_sections,
         sections_of("Errors", runs, lambda run: _errors(run, answers[run]), meanings(RSSI_PREDICTORS)),
         limits(runs[0], *(LIMITS if Maps(runs[0]).quantity == "RSSI" else ())),
     ]
@@ -67,7 +69,7 @@ def page(runs: list[Records]) -> Page:
         sections[0].parts.append(sections_of("Where to measure next", runs, _suggestion))
     details = [provenance(runs)]
     if len(runs) > 1 or any(len(Maps(run).names) > 1 or Maps(run).suffix for run in runs):
-        sections.insert(1, sections_of("Maps", runs, partial(_maps, kind="predicted")))
+        sections.insert(len(first_sections), sections_of("Maps", runs, partial(_maps, kind="predicted")))
         by_receiver = sections_of("Errors by receiver", runs, lambda run: Section("", plots=_differences(run)))
         widths = sections_of("Widths of the intervals", runs, partial(_maps, kind="width"))
         details[:0] = [by_receiver, *([widths] if widths.all_plots else [])]
@@ -86,13 +88,15 @@ def _summary(run: Records, found: Answer) -> Summary:
     best = best_baseline(run)
     unit = floors[0].error_unit
     covered = [(maps, maps.coverage["covered"]) for maps in floors]
+    with_coverage = [maps for maps in floors if maps.has_coverage]
     numbers = [
         *(Number(f"{share:.0%}", f"of {maps.place} {maps.limit}") for maps, share in covered if share is not None),
         Number(f"{error[found.chosen]['median']:.2f} {unit}", f"median absolute error of {found.chosen}"),
         Number(f"{error[best]['median']:.2f} {unit}", f"that of {best}, the best other method"),
         Number(f"{interval['coverage']:.0%}", f"of the test measurements in their {interval['nominal']:.0%} interval"),
     ]
-    plots = [Maps.coverage_plot(floors), *(maps.summary() for maps in floors if len(floors) == 1)]
+    plots = [Maps.coverage_plot(with_coverage)] if with_coverage else []
+    plots += [maps.summary() for maps in floors if len(floors) == 1]
     return Summary(numbers, plots, found.conclusion, found.next_steps, notes=notes(run))
 
 
@@ -192,10 +196,10 @@ def conclusion(run: Records) -> list[str]:
         f"{interval['nominal']:.0%} intervals. {tested}"
     )
     compared = comparison_sentence(errors, own, best, name=own, unit=unit, rows="measurements")
+    covered = [coverage.coverage_sentence(maps.coverage, f"{maps.who} {maps.limit}", maps.place) for maps in floors]
     return [
         *recommendation(run, own, unit)[1],
-        *(coverage.coverage_sentence(maps.coverage, f"{maps.who} {maps.limit}", maps.place) for maps in floors),
-        *filter(None, [coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
+        *filter(None, [*covered, coverage.bands_sentence(run), coverage.spots_sentence(floors)]),
         *filter(None, [coverage.held_out_sentence(run), coverage.why(run)]),
         sure,
         compared,

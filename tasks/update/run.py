@@ -22,7 +22,7 @@ from swiftwrf.rssi import RssiModel
 from swiftwrf.runtime import checkpoint
 from swiftwrf.runtime.durable import write_json
 from tasks.configs import TABLE_SUFFIX, UpdateConfig
-from tasks.directory import Claim, begun, new_directory
+from tasks.directory import Claim, begun, model_file, new_directory
 from tasks.environment import environment, invocation
 from tasks.options import by_name
 from tasks.page.page import REPORT, write_page
@@ -168,7 +168,7 @@ def _unit(model: FieldModel | RssiModel) -> str:
 
 
 def _model(path: str) -> FieldModel | RssiModel:
-    model = load(path)
+    model = load(model_file(Path(path)))
     if isinstance(model, RssiModel) or (isinstance(model, FieldModel) and model.updates):
         return model
     raise InputError(

@@ -287,11 +287,18 @@ def test_a_file_without_digests_recognises_what_it_learns_from_now_on(tmp_path):
     assert model.forget(torch.tensor([0, N])).is_learnt(data()).tolist() == [False] * (N + 1) + [True] * (M - 1)
 
 
-def test_spectra_of_a_folder_are_learnt(tmp_path, capsys):
+def test_a_run_without_a_model_of_rssi_is_refused(tmp_path, capsys):
+    (tmp_path / "config.json").write_text("{}")
+    assert quick.run("update", tmp_path, tmp_path, "--out", tmp_path / "updated") == 2
+    assert "is a run without an RSSI model; name one of its models" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "."])  # the latter is the directory of a run
+def test_spectra_of_a_folder_are_learnt(tmp_path, capsys, file):
     fitted("gp").save(tmp_path / "model.safetensors")
     (tmp_path / "new").mkdir()
     write_spectra(data().subset(torch.arange(N, N + M)), tmp_path / "new")
-    assert quick.run("update", tmp_path / "model.safetensors", tmp_path / "new", "--out", tmp_path / "updated") == 0
+    assert quick.run("update", tmp_path / file, tmp_path / "new", "--out", tmp_path / "updated") == 0
     *_, learnt, _, _, step, report = capsys.readouterr().out.splitlines()
     assert f"{M} measurements learnt" in learnt
     assert step.startswith("Continue with the updated model: swiftwrf update ")

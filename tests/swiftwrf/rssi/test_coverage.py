@@ -134,7 +134,7 @@ def test_a_small_area_without_coverage_comes_before_a_large_uncertain_one():
     x, field = np.arange(8.0), np.full((1, 1, 8), -70.0, dtype=np.float32)
     chart = RssiMap(x, np.zeros(1), 1.0, 1.0, field, np.ones_like(field), np.ones_like(field), ("a",))
     measured, limits = np.ones_like(probability, dtype=bool), {"threshold_dbm": -70.0, "certainty": 0.9, "at_least": 1}
-    limits["direction"] = "above"
+    limits |= {"direction": "above", "n_scans": 8}
     spots = Coverage(probability, measured, measured, limits).weak_spots(chart)
     assert spots[["x_m", "area_m2", "not_covered_m2"]].to_numpy().tolist() == [[7.0, 1.0, 1.0], [0.0, 6.0, 0.0]]
 
@@ -226,7 +226,10 @@ def test_a_row_at_a_receiver_that_moves_is_no_scan():
     moving = Rssi(
         data.rssi_dbm, data.transmitter_position, receiver_position=data.receiver_position, receiver_moves=True
     )
-    assert Coverage.of(chart, moving, (-75.0, 0.9, 1)).values["scans_above"] is None
+    found = Coverage.of(chart, moving, (-75.0, 0.9, 1))
+    fractions = ("scans_above", "covered", "uncertain", "not_covered", "not_measured")
+    assert [found.values[name] for name in ("n_scans", *fractions)] == 6 * [None]
+    assert not len(found.weak_spots(chart))
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0, 2.0, 3.0])

@@ -209,3 +209,18 @@ def test_no_share_is_stated_of_a_floor_without_measured_cells(building):
     assert "No cell of the map is in the measured area of floor 1." in found.summary.conclusion
     stated = [number.meaning for number in found.summary.numbers if number.value.endswith("%")]
     assert [meaning.partition(" above")[0] for meaning in stated[:-1]] == ["of the measured area of Ground floor"]
+
+
+def test_nothing_is_covered_between_ends_that_both_move(tmp_path):
+    """Places where a receiver was are not there at once; 0 % was stated before, whatever the links were."""
+    draw = np.random.default_rng(0)
+    links = pd.DataFrame(draw.uniform(0, 9, (60, 4)), columns=["tx_x", "tx_y", "rx_x", "rx_y"])
+    links["rssi"] = (-40 - 20 * np.log10(1 + np.hypot(links.tx_x - links.rx_x, links.tx_y - links.rx_y))).round()
+    links.to_csv(tmp_path / "links.csv", index=False)
+    with quick.recorded(tmp_path), quick.sketched():
+        assert quick.command("rssi", "--data", tmp_path / "links.csv", "--out", tmp_path / "run") == 0
+    report = unescape(re.sub("<[^>]*>", "", (tmp_path / "run" / "report.html").read_text()))
+    for text in ((tmp_path / "out.txt").read_text(), report):
+        assert "Predictions are within" in text
+        assert not re.search(r"is covered|[Ww]eak spots|threshold|% of the measured area", text)
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["coverage"][0]["covered"] is None

@@ -298,7 +298,7 @@ def test_each_floor_has_its_maps_its_rows_and_its_widest_place(tmp_path):
 
 def test_a_measured_area_without_cells_has_no_coverage(tmp_path):
     found = {"covered": None, "not_covered": None, "uncertain": None, "not_measured": None, "scans_above": None}
-    assert coverage_sentence(found, "a above -75 dBm") == "No cell of the map is in the measured area."
+    assert coverage_sentence(found | {"n_scans": 0}, "a above -75 dBm") == "No cell of the map is in the measured area."
 
 
 @pytest.mark.parametrize("seed", [0, 1])
