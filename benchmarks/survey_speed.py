@@ -16,6 +16,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
@@ -65,6 +66,8 @@ class Config:
     """survey of `locate`, or channels of `circular`"""
     n_packets: int = 5_000_000
     """rows of `packets`"""
+    repeats: int = 1
+    """runs of a case in each checkout, in turn; medians are written"""
 
 
 def main(config: Config) -> None:
@@ -81,8 +84,9 @@ def main(config: Config) -> None:
 def measured(case: Case, folder: Path, config: Config) -> dict[str, Any]:
     """Return seconds and peak memory of a case in this checkout, and in the other one."""
     arguments = command(case, folder, config)
-    found = {"here": run(arguments, folder, ROOT)}
-    return found if config.against is None else found | {"against": run(arguments, folder, config.against)}
+    checkouts = {"here": ROOT} | ({} if config.against is None else {"against": config.against})
+    runs = [{name: run(arguments, folder, of) for name, of in checkouts.items()} for _ in range(config.repeats)]
+    return {name: {key: median(one[name][key] for one in runs) for key in runs[0][name]} for name in checkouts}
 
 
 def command(case: Case, folder: Path, config: Config) -> list[str]:

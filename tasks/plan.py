@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -215,16 +215,16 @@ def _maps(found: CoveragePlan) -> list[Plot]:
     floors = found.survey.floors
     number = torch.zeros(len(found.cells)).long() if floors is None else floors.number(found.cells)
     chosen = found.candidates[list(found.chosen)]
+    floor_of = torch.zeros(len(chosen)).long() if floors is None or not len(chosen) else floors.number(chosen)
     plots = []
     for floor in number.unique().tolist():
         here, name = number == floor, "" if floors is None else floors.names[floor]
         at = found.cells[here].numpy()
-        mine = chosen if floors is None or not len(chosen) else chosen[floors.number(chosen) == floor]
+        mine = {rank: chosen[rank - 1].tolist() for rank, own in enumerate(floor_of.tolist(), start=1) if own == floor}
         panels = []
         for title, values_of in zip(("before", "after"), found.probability[:, here].numpy(), strict=True):
-            panels.append(
-                _panel(found.survey, at, values_of, f"{title} {name}".strip(), mine if title == "after" else mine[:0])
-            )
+            added = mine if title == "after" else {}
+            panels.append(_panel(found.survey, at, values_of, f"{title} {name}".strip(), added))
         data = DataFrame(at.round(3), columns=["x_m", "y_m", "z_m"])
         before, after = found.probability[:, here].numpy().round(4)
         caption = (
@@ -237,17 +237,21 @@ def _maps(found: CoveragePlan) -> list[Plot]:
 
 
 def _panel(
-    survey: Rssi, at: NDArray[np.float64], probability: NDArray[np.float64], title: str, chosen: Tensor
+    survey: Rssi,
+    at: NDArray[np.float64],
+    probability: NDArray[np.float64],
+    title: str,
+    added: Mapping[int, list[float]],
 ) -> Figure:
-    """Draw the probability (n,) in cells (n, 3) [m], receivers, and the chosen places (k, 3) [m]."""
+    """Draw the probability (n,) in cells (n, 3) [m], receivers, and places (3,) [m] of access points by their number."""
     sides = np.ptp(at[:, :2], axis=0)
     figure, plan = figures.panel(4.6, 0.8 + 3.4 * float(np.clip(sides[1] / max(sides[0], 1e-9), 0.4, 1.6)))
     x, y = at[:, :2].T
     drawn = plan.scatter(x, y, c=probability, s=9, marker="s", cmap="viridis", vmin=0, vmax=1, rasterized=True)
     plan.plot(*survey.receiver_position[survey.receiver_located][:, :2].numpy().T, "^", color=MEASURED, markersize=6)
-    for rank, place in enumerate(chosen[:, :2].tolist(), start=1):
-        plan.plot(*place, "X", color=NEXT, markersize=9)
-        plan.annotate(str(rank), place, xytext=(5, 5), textcoords="offset points", fontsize=8)
+    for rank, (x_m, y_m, _) in added.items():
+        plan.plot(x_m, y_m, "X", color=NEXT, markersize=9)
+        plan.annotate(str(rank), (x_m, y_m), xytext=(5, 5), textcoords="offset points", fontsize=8)
     plan.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     plan.set_title(title, fontsize=9)
     figures.colour_bar(plan, drawn, "probability")

@@ -47,7 +47,7 @@ def cross_validation_sentences(fraction: FractionRecords) -> list[str]:
             f"the median error by {rule['change']:+.0%} [{rule['low']:+.0%}, {rule['high']:+.0%}], from "
             f"{validation['measured_only_deg']:.2f} to {rule['median_deg']:.2f} degrees, with their number chosen on other "
             "held-out spectra. "
-            f"The best number is {best['n_synthetic']}."
+            + (f"The best number is {best['n_synthetic']}." if best["change"] < 0 else "No number reduces it.")
         )
         texts.append(f"{found} {_advice(validation)}")
     return texts

@@ -7,8 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import quick
+import torch
 from scipy.stats import norm
 from test_receivers_run import RECEIVERS, write_hall
+
+from swiftwrf import Rssi
+from swiftwrf.contrib.survey.plan import CoveragePlan
+from swiftwrf.data.coordinates import Floors
+from tasks.plan import _maps
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +76,18 @@ def test_access_points_that_add_little_are_said_not_to_be_worth_it(run, tmp_path
         "report: ",
     ]
     assert [printed.index(part) for part in order] == sorted(printed.index(part) for part in order)
+
+
+def test_access_points_keep_their_numbers_on_the_maps_of_floors():
+    """The first of three is on the upper floor, the others below."""
+    at = torch.tensor([[1.0, 2.0, 1.0], [4.0, 3.0, 1.0], [2.0, 5.0, 4.0]], dtype=torch.float64)
+    cells, none = at.repeat(4, 1), torch.zeros(0)
+    survey = Rssi(torch.full((3, 1), -60.0), at, floors=Floors(("G", "1"), (1.0, 4.0)))
+    plan = CoveragePlan(-67.0, none, none, at, none, (2, 0, 1), none, cells, torch.rand(2, 12), survey)
+    numbers = [
+        [{text.get_text(): text.xy for text in panel.axes[0].texts} for panel in plot.panels] for plot in _maps(plan)
+    ]
+    assert numbers == [[{}, {"2": (1.0, 2.0), "3": (4.0, 3.0)}], [{}, {"1": (2.0, 5.0)}]]
 
 
 def test_own_places_are_compared(run, tmp_path, capsys):

@@ -465,6 +465,9 @@ def test_whether_synthetic_spectra_help(said):
             (text,) = aoa_room.cross_validation_sentences(fraction)
         assert said_of(text)[:7] == [30, -20, 100 * more["rule"]["low"], -5, 2.0, 1.6, 300]
         assert words in text
+    worse = {"gains": [gain | {"change": 0.1} for gain in VALIDATION["gains"]]}
+    with mock.patch.dict(fraction.mix["cross_validation"]["gp"], worse):
+        assert "No number reduces it." in aoa_room.cross_validation_sentences(fraction)[0]
     plot = aoa_room._gain(fraction, "gp", VALIDATION)
     assert plot.panels[0].axes[0].lines[0].get_xydata().tolist() == [[0, 0], [300, -25], [1000, -25]]
 
