@@ -97,15 +97,16 @@ class GeometryModel(Linked, FieldModel):
 
     def _fit(self, train: Spectra, *, like: FieldModel | None = None, progress: bool = False, **_: Any) -> None:
         owner, known = fingerprint(train), like.room if like else None
+        self.fingerprint = owner
         if known is None:
             self.estimate = search_room(train, self.config, progress)
-        elif known.fingerprint == owner:
-            self.estimate, self.furniture, self.fingerprint = known.estimate, known.furniture, owner
+            self.furnish(train)
             return
-        else:
+        self.estimate, self.furniture = known.estimate, known.furniture
+        if known.fingerprint != owner:
             self.estimate = refine_room(known.estimate, train, self.config)
-        self.fingerprint = owner
-        self.furnish(train)
+            if train.channel is not None:  # what stands in the room is fitted anew, and not searched either
+                self.furniture = self.furnished_on(train).furniture
 
     def furnish(self, train: Spectra) -> None:
         """Estimate what stands in the room, if there are channels."""

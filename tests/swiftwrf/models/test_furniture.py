@@ -2,7 +2,9 @@
 
 import json
 import math
+from copy import copy
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from swiftwrf.locate.spectrum_likelihood import SCALES, PathLikelihood
 from swiftwrf.models.geometry import GeometryModel, Plane, furniture
 from swiftwrf.models.geometry.channels import Channels, coherence, sources, superposed, waves
 from swiftwrf.models.geometry.fit import observe
-from swiftwrf.models.geometry.furniture import Furniture
+from swiftwrf.models.geometry.furniture import Furniture, fit_furniture
 from swiftwrf.models.geometry.images import PlaneSet, images
 from swiftwrf.testing import check_saved
 from tasks.aoa.room import furniture_panels
@@ -79,6 +81,20 @@ def furnished_room(request):
     data, walls = measured(6.0, request.param, n=80, noise=0.1)
     train = data.subset(torch.arange(70))
     return train, data.subset(torch.arange(70, 80)), fitted(walls, train)
+
+
+@pytest.mark.parametrize("furnished_room", ["transmitter"], indirect=True)
+def test_furniture_of_a_known_room_is_fitted_anew_and_not_searched(furnished_room):
+    train, _, room = furnished_room
+    some = train[:50]
+    with mock.patch("swiftwrf.models.geometry.model.find_furniture", side_effect=AssertionError("no search")):
+        found, bare = GeometryModel().fit(some, like=room), copy(room)
+        bare.furniture = None
+        assert GeometryModel().fit(some, like=bare).furniture is None
+    again = fit_furniture(room.furniture.joined(found.tensors()), found.channels(some), room.furniture)
+    assert torch.equal(found.furniture.absorption, again.absorption)
+    assert found.furniture.voxel_m == room.furniture.voxel_m
+    assert not torch.equal(found.furniture.absorption, room.furniture.absorption)
 
 
 @pytest.mark.parametrize("moving", ["transmitter", "receiver"])
