@@ -32,6 +32,20 @@ def aoa_shares() -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
     ]
 
 
+def held_out_rooms() -> str:
+    """Return held-out PSNR of hybrid with a room of two searches, each without two folds, and of one, beside its test."""
+    rows = []
+    for row in load("held_out_rooms")["scenes"]:
+        ways = [row["searched"], row["decided"]]
+        psnr_db = [*(way["psnr_db"]["hybrid"] for way in ways), row["test"]["hybrid"]]
+        seconds = (f"{sum(way['seconds']):.1f} s" for way in ways)
+        rows.append(
+            [row["scene"].partition(",")[0], str(row["n"]), *(f"{value:.2f} dB" for value in psnr_db), *seconds]
+        )
+    columns = ["scene", "measured", "two searches", "one search", "test positions", "processor, two", "folds of one"]
+    return markdown(columns, rows)
+
+
 def turbo_condition(mix: dict[str, Any]) -> Condition:
     """Return the network's condition with synthetic spectra that a user would choose."""
     return chosen(conditions_of(mix["methods"]).values())

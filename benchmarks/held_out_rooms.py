@@ -1,4 +1,4 @@
-"""What held-out spectra say of field models whose room was found with them, beside two searches that leave them out.
+"""Held-out PSNR of field models whose room was found with the held-out spectra, beside that of searches without them.
 
 python benchmarks/held_out_rooms.py --data /data/newrf-bedroom /data/newrf-office
 

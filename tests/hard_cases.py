@@ -18,8 +18,9 @@ from swiftwrf.rasterize import reference
 from swiftwrf.rasterize.operators import magnitude
 
 VALUE_TOLERANCE = {None: 5e-6, 1e-4: 3e-4}
-# One of 500 random scenes has more than 1e-5: gradients of a narrow primitive cancel. The dense float32 definition has 1e-3.
-GRADIENT_TOLERANCE = {None: 3e-5, 1e-4: 3e-5}
+# One of 500 random scenes has more than 1e-5, one that hypothesis found 4e-5: gradients of a narrow primitive cancel. The
+# dense float32 definition has 1e-3.
+GRADIENT_TOLERANCE = {None: 5e-5, 1e-4: 5e-5}
 Inputs = tuple[Tensor, Tensor, Tensor]  # mean, Cholesky factor, weight
 Draw = Callable[[Tensor, Tensor, Tensor, AngularGrid, float | None], Tensor]
 STEP = math.radians(90 / 16)  # about two pixels of the small grid

@@ -350,6 +350,7 @@ OF_CHANNELS = {
     FieldModel.fit: (channels, lambda data: at_new(GeometryModel().fit(data, like=room()))),
     FieldModel.update: (channels, lambda data: at_new(room().update(data))),
     GeometryModel.channels: (channels, lambda data: room().channels(data).value.abs()),
+    GeometryModel.decided_on: (channels, lambda data: at_new(room().decided_on(data))),
     GeometryModel.furnished_on: (channels, lambda data: at_new(room().furnished_on(data))),
     GeometryModel.of_planes: (channels, lambda data: at_new(GeometryModel.of_planes(data, [FLOOR]).update(channels()))),
     MatchedField.fit: (channels, located_by_channels),

@@ -14,15 +14,19 @@ from unittest import mock
 
 import pytest
 import torch
+from pandas.testing import assert_frame_equal
 from sums import STEPS, Sum, kill, kill_once, leave, refuse, results
 
-from swiftwrf import FitError, InputError
+from swiftwrf import FitError, InputError, rssi_room
+from swiftwrf.contrib.comparison.rssi import compare
+from swiftwrf.contrib.comparison.steps import Memo
 from swiftwrf.runtime.threads import set_threads
 from tasks.command import PRELOADED
 from tasks.configs import AoaConfig
 from tasks.directory import Run
 from tasks.environment import number_of_processes
 from tasks.preload import SERVED
+from tasks.workers import local_processes
 
 HERE = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": f"{HERE}{os.pathsep}{HERE.parent}"}
@@ -152,6 +156,16 @@ def test_one_process_with_one_thread_and_on_a_gpu():
     assert number_of_processes(torch.device("cpu"), 3) == 3
     with pytest.raises(InputError, match="--processes 2 is for steps on the CPU"):
         number_of_processes(torch.device("cuda"), 2)
+
+
+def test_predictors_that_processes_fit_are_those_fitted_here(tmp_path):
+    data, options = rssi_room(n=60).columns([0]), {"only": ["knn"], "fewer": (0.5,)}
+    here, memo = compare(data, **options), Memo(tmp_path)
+    with local_processes(2, memo.folder) as two:
+        there = compare(data, **options, executor=two)
+    assert_frame_equal(there.errors, here.errors)
+    assert_frame_equal(there.by_rows, here.by_rows)
+    assert list(there.predictors) == ["swiftwrf"]
 
 
 def is_running(process):
