@@ -83,7 +83,7 @@ class Maps:
 
     @property
     def has_coverage(self) -> bool:
-        """Whether receivers stay where they are, so that a scan may have one of them."""
+        """True if receivers stay where they are, so that a scan may have one of them."""
         return self.coverage["n_scans"] is not None
 
     @property

@@ -105,7 +105,7 @@ class GeometryModel(Linked, FieldModel):
         self.estimate, self.furniture = known.estimate, known.furniture
         if known.fingerprint != owner:
             self.estimate = refine_room(known.estimate, train, self.config)
-            if train.channel is not None:  # what stands in the room is fitted anew, and not searched either
+            if train.channel is not None:  # what stands in the room is fitted again, and not searched either
                 self.furniture = self.furnished_on(train).furniture
 
     def furnish(self, train: Spectra) -> None:

@@ -84,7 +84,7 @@ def furnished_room(request):
 
 
 @pytest.mark.parametrize("furnished_room", ["transmitter"], indirect=True)
-def test_furniture_of_a_known_room_is_fitted_anew_and_not_searched(furnished_room):
+def test_furniture_of_a_known_room_is_fitted_again_and_not_searched(furnished_room):
     train, _, room = furnished_room
     some = train[:50]
     with mock.patch("swiftwrf.models.geometry.model.find_furniture", side_effect=AssertionError("no search")):

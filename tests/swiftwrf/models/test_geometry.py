@@ -375,7 +375,7 @@ def test_a_room_on_other_spectra_has_their_uncertainty_and_scores(room):
 
 
 def test_other_spectra_decide_which_planes_of_a_room_exist():
-    """Of six planes that stand a centimetre off, two of which are not there, the other four remain, at their places."""
+    """Six planes stand a centimetre off, and two are not there: the other four remain, at their places."""
     real = {normal: offset for normal, offset in SIX.items() if normal[1] == 0}
     data = mirror_room(real, 4 * (-0.6,), n=40, noise=0.1)
     moved = [Plane(normal, offset + 0.01, gain=-0.5) for normal, offset in SIX.items()]
