@@ -1,10 +1,10 @@
 """Choice of a field model by cross-validation on measured spectra.
 
 Some models search for a structure (walls, number of primitives) before they fit parameters. A search takes most of the time,
-so it is not repeated in every fold. No fold is predicted with a structure that its spectra helped to find. One search leaves
-out folds 0 and 1, another leaves out folds 2 and 3. A model reuses the structure of the search that left its fold out, and
-fits its parameters to all other folds. Fold 4 takes part in both searches and is never predicted. If a search without two
-folds had too few spectra, each fold has a separate search.
+so it is not repeated in every fold. By default no fold is predicted with a structure that its spectra helped to find. One
+search leaves out folds 0 and 1, another leaves out folds 2 and 3. A model reuses the structure of the search that left its
+fold out, and fits its parameters to all other folds. Fold 4 takes part in both searches and is never predicted. If a search
+without two folds had too few spectra, each fold has a separate search.
 
 Turbo learning gives rooms instead, one for each pair of folds. A search of all measured spectra finds their planes once. The
 spectra outside the pair decide which planes exist, where, and what stands among them (`GeometryModel.decided_on`).
@@ -40,7 +40,8 @@ class Fold:
     """A field model fitted to some of the measured spectra, and the spectra that were held out from it.
 
     Args:
-        model: Model fitted to `train`. Neither its parameters nor its structure depend on `test`.
+        model: Model fitted to `train`. Its parameters do not depend on `test`. Its structure does not either, except where it
+            is that of `structures` whose search took all spectra.
         train: Measured spectra that the model was fitted to.
         test: Measured spectra that were held out.
 

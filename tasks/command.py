@@ -40,9 +40,9 @@ COMMANDS = {
     "scenes": Command("ScenesConfig", "tasks.scenes"),
     "view": Command("ViewConfig", "tasks.view.sources"),
 }
-# modules that processes of a run load while the run itself begins
 DRAWING = ("tasks.page.figures",)
 BASELINES = ("sklearn.linear_model", "sklearn.gaussian_process", "sklearn.neighbors")
+# modules that processes of a run load while the run itself begins
 PRELOADED = {
     "aoa": ("augment.turbo.learning", "torchvision", "torch._dynamo", *DRAWING),
     "rssi": ("swiftwrf.contrib.comparison.rssi_baselines", *BASELINES, *DRAWING),

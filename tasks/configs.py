@@ -36,6 +36,11 @@ class StepsConfig(ReadingConfig):
     """processes of this machine that compute the steps, a gigabyte of memory each (default: one a thread, at most 4; one on
     a GPU)"""
 
+    @property
+    def own_processes(self) -> int | None:
+        """Number of `processes`: one beside a scheduler, whose workers compute."""
+        return 1 if self.scheduler else self.processes
+
     def check(self) -> None:
         super().check()
         if self.processes is not None and self.scheduler is not None:

@@ -81,7 +81,7 @@ def run(config: AoaConfig, resume: Path | None = None) -> None:
     source |= data.source
     with (
         connected(config.scheduler, device) as cluster,
-        Run("aoa", label, config, device, source, resume, 1 if cluster else config.processes, described) as run,
+        Run("aoa", label, config, device, source, resume, config.own_processes, described) as run,
     ):
         with workers_of(run, cluster) as workers, terminal.progress():
             results = learn(experiment, run, workers)

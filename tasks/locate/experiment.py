@@ -49,9 +49,7 @@ def run(config: LocateConfig, resume: Path | None = None) -> None:
     label = f"{'stations' if isinstance(data, Stations) else 'rx' + '_'.join(config.receivers)}-s{config.seed}"
     with (
         connected(config.scheduler, device) as cluster,
-        Run(
-            "locate", label, config, device, source, resume, 1 if cluster else config.processes, _described
-        ) as directory,
+        Run("locate", label, config, device, source, resume, config.own_processes, _described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             common: Row = {"split": config.split, "seed": config.seed, "keep": directory, "executor": workers}

@@ -51,7 +51,7 @@ def run(config: RssiTaskConfig, resume: Path | None = None) -> None:
 
     with (
         connected(config.scheduler, device) as cluster,
-        Run("rssi", label, config, device, source, resume, 1 if cluster else config.processes, described) as directory,
+        Run("rssi", label, config, device, source, resume, config.own_processes, described) as directory,
     ):
         with workers_of(directory, cluster) as workers, terminal.progress():
             result = compare(

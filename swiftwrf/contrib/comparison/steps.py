@@ -24,7 +24,7 @@ from swiftwrf.runtime.durable import strict, write_json
 STEPS = "steps"  # folder, beside the results, of kept values and of files that only later steps read
 MODEL, LOCATOR = "model.safetensors", "locator.safetensors"  # fitted models of RSSI, among the results
 ORIGIN = "origin"  # what the kept results are of
-NOT_OF_RESULTS = ("keep", "executor", "progress")  # arguments on which no result depends
+NOT_OF_RESULTS = ("keep", "executor", "parallel", "progress")  # arguments on which no result depends
 POLL_S = 2  # between two checks that there are workers
 
 Row = dict[str, Any]
