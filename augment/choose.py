@@ -40,8 +40,8 @@ class Fold:
     """A field model fitted to some of the measured spectra, and the spectra that were held out from it.
 
     Args:
-        model: Model fitted to `train`. Its parameters do not depend on `test`. Its structure does not either, except where it
-            is that of `structures` whose search took all spectra.
+        model: Model fitted to `train`. Its parameters do not depend on `test`. Its structure does not either, except where
+            that is one of `structures` whose search took all spectra.
         train: Measured spectra that the model was fitted to.
         test: Measured spectra that were held out.
 
